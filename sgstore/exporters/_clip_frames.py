@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 
 
 WINDOW: Final = 240
-"""Frames that are read from the store at once, as columns."""
+"""Number of frames that are read from the store at once as columns."""
 
 FEW: Final = 60
-"""Frames at once for single graphs, which take ten times the memory of columns."""
+"""Number of frames that are read at once as single graphs. These need ten times the memory of columns."""
 
 _FRAMES: Final = """
 SELECT frame_id, seq, time_ns, log_time_ns, t FROM frames
@@ -40,7 +40,7 @@ _TYPES: Final[dict[str, Any]] = {
     **dict.fromkeys(("frame_id", "seq", "time_ns", "log_time_ns"), np.int64),
     "t": np.float64,
 }
-"""Columns of :class:`ClipFrames`."""
+"""Types of the columns of :class:`ClipFrames`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +114,7 @@ class Export:
             yield frames
 
     def own_numbers(self) -> list[int]:
-        """Return the number of each clip among those of its trace, from 1."""
+        """Return the number of each clip among the clips of its trace, counted from 1."""
         seen = Counter[str]()
         numbers: list[int] = []
         for clip in self.clips:
@@ -130,7 +130,7 @@ class Export:
             self.tell(frames.number, len(self.clips))
 
     def fresh_windows(self) -> Iterator[ClipFrames]:
-        """Yield groups of frames in which a frame of several clips occurs only once, with its first clip."""
+        """Yield groups of frames. A frame in several clips is included only once, for its first clip."""
         for frames in self.windows():
             time = frames.log_time_ns
             slack = tolerance_ns(self.trace(frames.clip.trace).period_ns)
@@ -160,7 +160,7 @@ class Export:
         return {} if self.labels is None else self.labels.of(frame_id)
 
     def label_types(self) -> dict[str, str]:
-        """Return the database type of each label: the narrowest type for all its values."""
+        """Return the database type of each label: the narrowest type that can hold all of its values."""
         if self.labels is None:
             return {}
         return {name: _type_of(values.tolist()) for name, values in self.labels.values.items()}
@@ -174,7 +174,7 @@ class Export:
             ]
 
     def about(self) -> dict[str, Any]:
-        """Return the content of the manifest file: clips, labels, and their sources."""
+        """Return the content of the manifest file: clips, labels, and the sources of both."""
         traces = {clip.trace: self.trace(clip.trace) for clip in self.clips}
         return {
             "clips": [

@@ -33,7 +33,7 @@ MANIFEST: Final = "manifest.json"
 _PREFIX: Final = ".export-"
 _FILES: Final = "files"
 _MOVING: Final = "moving.json"
-"""Journal in the temporary folder: its files, and their identities once they are being moved."""
+"""Name of the journal in the temporary folder: its files, and their identities while they are moved."""
 
 _UNSAFE: Final = re.compile(r"[^A-Za-z0-9._-]+")
 _RESERVED: Final = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?")
@@ -189,7 +189,7 @@ def safe_name(text: str, otherwise: str) -> str:
 
 
 def check_folder(to: Path) -> None:
-    """Raise an error if an export cannot be written into a folder. This is checked before the search.
+    """Raise an error if an export cannot be written into a folder. It is called before the search.
 
     Parameters
     ----------
@@ -249,13 +249,13 @@ def export_folder(to: Path) -> Generator[Path]:
 
 
 def _mark(thing: Path) -> list[int]:
-    """Return numbers that identify a file or folder, also after a move."""
+    """Return numbers that identify a file or folder even after it is moved."""
     about = thing.lstat()
     return [about.st_dev, about.st_ino]
 
 
 def _undo(left: Path) -> None:
-    """Remove the files that a killed export has already moved to its target folder."""
+    """Remove the files that a killed export has already moved into its target folder."""
     try:
         marks = json.loads((left / _MOVING).read_text(encoding="utf-8"))
     except (OSError, ValueError):  # the move had not begun
@@ -277,7 +277,7 @@ def _is_the(thing: Path, mark: list[int]) -> bool:
 
 
 def _is_kept_free(target: Path, thing: Path) -> bool:
-    """True if a target file is still the empty placeholder of a file that has not been moved."""
+    """True if a target file is still the empty placeholder for a file that was not moved yet."""
     if target.is_symlink() or not (target.exists() and thing.exists()):
         return False
     return not any(target.iterdir()) if target.is_dir() else not target.stat().st_size
@@ -306,7 +306,7 @@ def write_manifest(folder: Path, form: str, content: Mapping[str, Any]) -> None:
 
 
 def _move(things: Sequence[Path], to: Path) -> None:
-    """Move files and folders into a folder, all or none, and overwrite nothing."""
+    """Move files and folders into a folder, all or none. Existing files are not overwritten."""
     moved: list[Path] = []
     try:
         for thing in things:

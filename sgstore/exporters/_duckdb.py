@@ -1,4 +1,4 @@
-"""Export format DuckDB: the frames of the clips as one file with the public views, for other clients.
+"""Export format DuckDB: the frames of the clips in one file with the public views, for other programs.
 
 The file has no clips. With ``--storage v1.0.0`` every DuckDB from 1.0 on reads it, and programs
 that contain one: dbt, ibis, SQLAlchemy, BI tools. It is no store: sgstore does not read it again.

@@ -148,7 +148,7 @@ def stamp(message: Any, time_ns: int) -> None:
 
 
 AXES: Final = "map"
-"""Name of the axes of all scene graphs, as in CARLA's bridge and most ROS systems."""
+"""Name of the coordinate axes of all scene graphs, as in CARLA's bridge and most ROS systems."""
 
 _ALL, _LINE_LIST = 1, 2
 
@@ -188,11 +188,11 @@ RELATION_COLOURS: Final[dict[str, Colour]] = {
 OTHER_RELATIONS: Final[Colour] = (0.55, 0.55, 0.55, 0.5)
 
 DOT: Final = 0.5
-"""Diameter of nodes without a size; m."""
+"""Diameter of the symbol of nodes without a size; m."""
 LINE: Final = 2.0
-"""Width of edges; pixels."""
+"""Width of the lines of edges; pixels."""
 TEXT: Final = 12.0
-"""Size of names; pixels."""
+"""Size of the text of names; pixels."""
 
 
 def message(graph: SceneGraph, log_time_ns: int) -> bytes:

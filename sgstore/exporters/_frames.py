@@ -40,16 +40,16 @@ if TYPE_CHECKING:
 
 
 WINDOW: Final = 2400
-"""Frames whose messages are searched in one pass over a recording."""
+"""Number of frames whose messages are searched in one pass over a recording."""
 
 ENDINGS: Final = {"jpeg": "jpg", "tiff": "tif"}
-"""Forms whose file ending differs from their name."""
+"""Form of a file → file suffix, if it differs from the name of the form."""
 
 FILE_COLUMNS: Final = (
     *("clip", "frame_id", "trace", "seq", "channel", "log_time_ns", "file", "holds", "form"),
     *("picture", "sha256"),
 )
-"""``picture``: index in the file of a video, from 0."""
+"""Columns of the table of files. ``picture`` is the index of the picture in a video file, from 0."""
 CHANNEL_COLUMNS: Final = ("trace", "channel", "schema", "holds", "frames", "files", "lost")
 
 _PAYLOADS: Final = """
@@ -59,7 +59,7 @@ ORDER BY frame_id, channel, log_time_ns, chunk_offset, message_offset
 """
 
 Place = tuple[int, int]
-"""Place of a message: offset of its chunk, and offset in the chunk."""
+"""Position of a message: offset of its chunk, and offset within the chunk."""
 
 
 @dataclass(slots=True)
@@ -74,14 +74,14 @@ class _FrameMessage:
 
 
 File = tuple[str, str, str, str, str]
-"""A written file, as the last columns of :data:`FILE_COLUMNS`: name, holds, form, picture, hash."""
+"""Written file, in the order of the last columns of :data:`FILE_COLUMNS`: name, holds, form, picture, hash."""
 Found = dict[tuple[str, Place], File | None]
-"""Files of messages, by channel and place; ``None`` means neither picture nor cloud."""
+"""Channel and position of a message → its file. ``None`` means neither a picture nor a point cloud."""
 
 
 @dataclass(slots=True)
 class _Film:
-    """Video file under construction, with the number of its pictures and the place of the last one."""
+    """Video file that is being written, with the number of its pictures and the position of the last one."""
 
     path: Path
     form: str
@@ -107,7 +107,7 @@ class _Count:
 
 @dataclass(slots=True)
 class _Tables:
-    """Tables that an export writes with the sensor files, and counts of the messages."""
+    """Tables that an export writes together with the sensor files, and counts of the messages."""
 
     files: Any
     frames: Any
@@ -259,7 +259,7 @@ class _Writing:
         wanted: dict[tuple[str, Place], _FrameMessage],
         found: Found,
     ) -> None:
-        """Write the messages at the given places of the recording to files.
+        """Write the messages at the given positions of the recording to files.
 
         ``None`` means that a message is neither a picture nor a point cloud.
         """
@@ -415,7 +415,7 @@ class _Writing:
 
 
 def _test_picture(path: Path, data: bytes) -> None:
-    """Raise an error if a written picture cannot be opened. Without Pillow, nothing is tested.
+    """Raise an error if a written picture cannot be opened. Without the package Pillow, do nothing.
 
     Raises
     ------

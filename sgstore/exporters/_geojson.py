@@ -47,9 +47,9 @@ _GEO: Final = re.compile(r"<geoReference>\s*(?:<!\[CDATA\[)?\s*([^<\]]+)")
 _OFFSET: Final = re.compile(r"<offset\b([^>]*)>")
 _NUMBER: Final = re.compile(r"(\w+)\s*=\s*[\"']([-+.\deE]+)[\"']")
 _DIGITS: Final = {True: 8, False: 3}
-"""Digits of coordinates in degrees and in metres: about a millimetre."""
+"""Number of digits of coordinates, in degrees and in metres: about a millimetre."""
 _TEXTS: Final = ("name", "lane_type", "road", "junction", "turn")
-"""Columns of texts of a road map that are properties of its features."""
+"""Text columns of a road map that become properties of its features."""
 
 
 def write(export: Export, folder: Path) -> list[WrittenFile]:
@@ -102,7 +102,7 @@ def _projection(text: str, crs: str) -> tuple[Placed | None, str]:
 
 
 def _entities(export: Export, frames: ClipFrames, placed: Placed | None) -> Iterator[Any]:
-    """Yield a feature for each entity of each frame of a clip."""
+    """Yield a GeoJSON feature for each entity in each frame of a clip."""
     for window in frames.windows():
         found = export.store.file.rows(_NODES, window.bounds).dicts()
         columns = export.label_columns(window.frame_id)
@@ -131,7 +131,7 @@ def _entities(export: Export, frames: ClipFrames, placed: Placed | None) -> Iter
 
 
 def _parts_of(name: str, text: str, placed: Placed | None) -> Iterator[Any]:
-    """Yield a feature for each outline of a road map."""
+    """Yield a GeoJSON feature for each outline of a road map."""
     road_map = read_map(text, name)
     drawn, nodes = DrawnOutlines.of(road_map), road_map.nodes
     places = np.column_stack([drawn.x, drawn.y]).astype(np.float64) + drawn.origin

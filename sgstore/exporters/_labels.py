@@ -32,12 +32,12 @@ if TYPE_CHECKING:
 NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,62}")
 
 _QUERY: Final = re.compile(r"\s*(MATCH|USING|DEFINE|HOLDS|NOT\s+MATCH)\b", re.IGNORECASE)
-"""Start of a complete query; other texts are expressions."""
+"""Regular expression of the start of a complete query. Other texts are expressions."""
 
 TAKEN: Final = frozenset(
     {"clip", "frame_id", "trace", "trace_id", "seq", "time_ns", "log_time_ns", "t", "ego", "map"}
 )
-"""Reserved names: columns of frames."""
+"""Names that labels cannot have, because columns of frames have them."""
 
 
 def parse_labels(pairs: Iterable[str]) -> dict[str, str]:
@@ -116,7 +116,7 @@ class Labels:
         return cls(texts, wanted, values)
 
     def of(self, frame_id: Ints) -> dict[str, list[Any]]:
-        """Return the labels of some frames as columns by name. They must be computed before."""
+        """Return labels of frames as columns by name. The labels must have been computed before."""
         rows = np.searchsorted(self.frame_id, frame_id)
         return {name: values[rows].tolist() for name, values in self.values.items()}
 
@@ -152,7 +152,7 @@ def _over_matches(
     matches: Matches,
     wanted: Ints,
 ) -> np.ndarray[Any, np.dtype[np.object_]]:
-    """Return a label column: the value of a match in all its frames. Other frames have no value."""
+    """Return a column of labels: the value of a match in all of its frames. Other frames have no value."""
     values = np.full(len(wanted), None, object)
     taken = np.zeros(len(wanted), np.bool_)
     traces = _trace_ids(store)
@@ -172,7 +172,7 @@ def _over_matches(
 def _answers(
     store: Store | Collection, text: str, wanted: Ints, parameters: Mapping[str, object]
 ) -> Iterator[tuple[Ints, np.ndarray[Any, np.dtype[np.object_]]]]:
-    """Yield indices of frames with the values of an expression there: frames with an ego, then others."""
+    """Yield indices of frames with the values of an expression: first frames with an ego, then the others."""
     value = f"{text}) AS label"
     try:
         matches = store.find(_OF_EGO + value, **parameters)
@@ -193,11 +193,11 @@ def _answers(
 _RETURNED: Final = "RETURN DISTINCT frame.id AS frame_of_label, ("
 _OF_EGO: Final = f"MATCH (:Ego) {_RETURNED}"
 _OF_ANYTHING: Final = f"MATCH (anything) {_RETURNED}"
-"""Query text before an expression."""
+"""Text of a query that stands before an expression."""
 
 
 def _of_expression(error: QueryError, text: str) -> QueryError:
-    """Return an error of the internal query as an error that points into the user's expression."""
+    """Convert an error of the internal query to an error that marks a part of the user's expression."""
     if error.span is None:
         return QueryError(error.reason, text=text, hint=error.hint)
     before, end = len(_OF_EGO), len(text)
@@ -216,7 +216,7 @@ def _columns(matches: Matches, wanted: Ints) -> tuple[Ints, np.ndarray[Any, np.d
 
 
 def _rows(wanted: Ints, frame_id: Ints) -> tuple[Ints, Ints]:
-    """Return the positions of the wanted frames in an array of frame ids, and their wanted indices."""
+    """Return positions of wanted frames in an array of frame ids, and their indices in ``wanted``."""
     row = np.minimum(np.searchsorted(wanted, frame_id), max(len(wanted) - 1, 0))
     of = np.flatnonzero(wanted[row] == frame_id) if len(wanted) else row[:0]
     return of, row[of]

@@ -61,7 +61,7 @@ _COMPRESSION: Final = {
     "": CompressionType.NONE,
 }
 _FIXED: Final = 8 + 8 + 4 + 4 + 8 + 4
-"""Bytes of an attachment without its texts and its data."""
+"""Size of an attachment record without its texts and its data; bytes."""
 _MALFORMED: Final = "an attachment is malformed and was left out"
 _DAMAGED: Final = "the checksum of an attachment does not match"
 
@@ -261,7 +261,7 @@ class _Cutting:
             yield number, channel.topic, schema.name if schema else ""
 
     def _write_head(self, reach: Clip) -> list[Loss]:
-        """Write the schemas, channels, metadata and attachments of the recording; return lost parts.
+        """Write the schemas, channels, metadata and attachments of the recording. Return the lost parts.
 
         ``reach`` is the interval with a time tolerance at its ends, as readers of the clip need it.
         """
@@ -305,7 +305,7 @@ class _Cutting:
         self._counts[record.id] = 0
 
     def _write_attachment(self, pieces: Iterable[memoryview]) -> str:
-        """Copy an attachment of the recording, given in pieces; return its defect, or an empty text.
+        """Copy an attachment of the recording, given in pieces. Return its defect, or an empty text.
 
         Returns
         -------
@@ -341,7 +341,7 @@ class _Cutting:
             self._counts[channel] += 1
 
     def _messages(self, reach: Clip) -> Iterator[ClipMessage]:
-        """Yield the recorded messages of the clip in order of time; context messages are also counted.
+        """Yield the recorded messages of the clip in order of time. Also count the context messages.
 
         A source without log times keeps the order of its file: while its clock runs backwards, log
         times stay constant.
@@ -374,7 +374,7 @@ class _Cutting:
 
 
 def _among(run: Messages, places: dict[int, list[int]]) -> NDArray[np.bool_]:
-    """Return a mask of the messages that are at given places of a recording (offsets by chunk)."""
+    """Return a mask of the messages whose position is in ``places`` (chunk offset → message offsets)."""
     chunks, found = run.chunks, np.zeros(len(run), np.bool_)
     for chunk in np.unique(chunks).tolist():
         found |= (chunks == chunk) & np.isin(run.offset, places.get(chunk, ()))

@@ -41,10 +41,10 @@ LABELS: Final = "/sgstore/labels"
 _SCHEMAS: Final[dict[str, Any]] = json.loads(
     resources.files("sgstore.exporters").joinpath("graph_schemas.json").read_text(encoding="utf-8")
 )
-"""JSON schemas of the messages ``graph`` and ``labels``."""
+"""JSON schemas of the added messages ``graph`` and ``labels``."""
 
 ClipMessage = tuple[int, int, int, int, bytes | memoryview]
-"""Channel, sequence number, log time and time of publication in ns, data."""
+"""Message of a clip: channel, sequence number, log time and publish time (ns), data."""
 
 
 def is_added(channel: Channel) -> bool:

@@ -62,7 +62,7 @@ _PLACE_DIGITS: Final = 4
 _TURN_DIGITS: Final = 9
 _UID: Final = "uid"
 _SECTIONS: Final = {"action": "actions", "event": "events", "context": "contexts", "tag": "tags"}
-"""Kinds of imported elements other than objects, and their sections."""
+"""Kind of imported elements other than objects → section of the file."""
 
 
 def write(export: Export, folder: Path) -> list[WrittenFile]:
@@ -217,7 +217,7 @@ class _Labelling:
             yield number, {"frame_properties": properties, **within[frame_id]}
 
     def _own(self, frames: ClipFrames) -> dict[tuple[int, int], dict[str, Any]]:
-        """Return the imported attributes without a column in the store, by frame and node."""
+        """Return the imported user-defined attributes by frame and node."""
         found: dict[tuple[int, int], dict[str, Any]] = {}
         if not self._trace.report.get("imported"):
             return found
@@ -367,7 +367,7 @@ def _json(value: Any) -> str:
 
 
 def _test(file: Path, clip: _Labelling) -> None:
-    """Raise an error if a written OpenLABEL file does not contain the same frames and objects."""
+    """Raise an error if a written OpenLABEL file does not have the expected frames and objects."""
     try:
         told = json.loads(file.read_text(encoding="utf-8"))["openlabel"]
         wrong = {*told["objects"]} != clip.objects() or not told["frames"]

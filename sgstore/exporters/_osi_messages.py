@@ -33,10 +33,10 @@ SENSOR_VIEW: Final = "osi3.SensorView"
 ROAD_MAP: Final = "osi3.MapAsamOpenDrive"
 
 OPENDRIVE: Final = "net.asam.opendrive"
-"""Type of a reference to the road map."""
+"""Value of the type field in a reference to the road map."""
 
 FIRST_NUMBER: Final = 1 << 40
-"""First number for entities without a numeric id; numbers of simulators are smaller."""
+"""First number for entities without a numeric id. Simulators use smaller numbers."""
 
 _VEHICLE_TYPES: Final = {
     "car": "TYPE_CAR",
@@ -78,7 +78,7 @@ _STATIONARY_TYPES: Final = {
     "prop speed_bump": "TYPE_SPEED_BUMP",
     "prop construction": "TYPE_CONSTRUCTION_SITE_ELEMENT",
 }
-"""Kind, or kind and subkind, of static objects → their type."""
+"""Kind, or kind and subkind, of static objects → OSI type."""
 
 _BULBS: Final = (("red", "COLOR_RED"), ("yellow", "COLOR_YELLOW"), ("green", "COLOR_GREEN"))
 
@@ -168,7 +168,7 @@ class OsiFrames:
                 self._write_standing(ground.stationary_object.add(), entity, kind)
 
     def _number(self, ident: str) -> int:
-        """Return the OSI number of an entity: its recorded id if that is a number, else a new number."""
+        """Return the OSI number of an entity: its recorded id if it is a number, otherwise a new number."""
         number = self._numbers.get(ident)
         if number is None:
             plain = ident.isascii() and ident.isdecimal() and str(int(ident)) == ident
@@ -225,7 +225,7 @@ class OsiFrames:
         about.type = _number_of(about, "type", _SIGN_TYPES.get(kind, "TYPE_OTHER"))
 
     def _write_light(self, ground: Any, entity: Entity) -> None:
-        """Write a traffic light as three OSI bulbs, one above another, that fill its box."""
+        """Write a traffic light as three OSI bulbs, one above the other, which fill its box."""
         numbers = self._bulbs.get(entity.ident)
         if numbers is None:
             numbers = (self._number(entity.ident), self._fresh(), self._fresh())
@@ -270,7 +270,7 @@ def _write_base(base: Any, values: dict[str, float]) -> None:
 
 
 def _write_vector(out: Any, names: dict[str, str], values: dict[str, float]) -> None:
-    """Write the known components of a vector into an OSI message; nothing if the first one is unknown.
+    """Write the known components of a vector into an OSI message. If the first one is unknown, write nothing.
 
     In OSI a missing number of a vector is 0, and a missing vector is unknown.
     """

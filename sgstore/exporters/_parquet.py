@@ -69,7 +69,7 @@ UNITS: Final = {
     **dict.fromkeys(("t", "offset_s"), "s"),
     **dict.fromkeys(("time_ns", "log_time_ns", "start_ns", "end_ns"), "ns"),
 }
-"""Units of columns; the others are names, counts, shares or truth values."""
+"""Column → unit. Other columns are names, counts, shares or truth values."""
 
 _CLIPS: Final = {
     "clip": "INTEGER",

@@ -38,14 +38,14 @@ if TYPE_CHECKING:
 
 
 BY_ITSELF: Final = "roadscene2vec"
-"""Default abstraction."""
+"""Name of the default abstraction."""
 
 ACTORS: Final = ("ego_car", "car", "moto", "bicycle", "ped", "lane", "light", "sign", "road")
 RELATIONS: Final = (
     *("isIn", "inDFrontOf", "inSFrontOf", "atDRearOf", "atSRearOf", "toLeftOf", "toRightOf"),
     *("near_coll", "super_near", "very_near", "near", "visible"),
 )
-"""Types of nodes and of edges of RoadScene2Vec, in its order."""
+"""Types of nodes and of edges in RoadScene2Vec, in its order."""
 
 _TYPE_OF: Final = {
     **dict.fromkeys(("Left Lane", "Middle Lane", "Right Lane"), "lane"),
@@ -57,7 +57,7 @@ FEATURES: Final = (
     ("up", "m", "above the ego's centre"),
     ("heading", "rad", "less the ego's heading, in (-pi, pi]"),
 )
-"""Columns of ``node_feature``: name, unit, meaning. NaN if the position or the ego is unknown."""
+"""Columns of ``node_feature`` with name, unit and meaning. NaN if the position or the ego is unknown."""
 
 _KINDS: Final = {
     "frame_id": ("<i8", 0),
@@ -71,7 +71,7 @@ _KINDS: Final = {
     "edge_index": ("<i4", 2),
     "edge_type": ("<i2", 0),
 }
-"""Columns: type, and numbers per row; 0 means one number without a second axis."""
+"""Columns → type, and number of values per row. 0 means one value without a second axis."""
 
 
 class _TensorColumns:
@@ -108,7 +108,7 @@ class _TensorColumns:
             stream.close()
 
     def _write_head(self, name: str) -> None:
-        """Write the header of a column file with the number of rows: first 0, at the end the final number."""
+        """Write the header of a column file with its number of rows. It is 0 first, and final at the end."""
         dtype, width = self._kinds[name]
         shape = (self._rows[name], width) if width else (self._rows[name],)
         # Numpy reserves room for the largest number, so that the length of the header is constant.
@@ -290,7 +290,7 @@ def _row(labelled: Labelled, frame: NDArray[Any], node: NDArray[Any]) -> NDArray
 def _codes(
     known: list[str], labels: NDArray[np.object_], meaning: Mapping[str, str]
 ) -> NDArray[np.int64]:
-    """Return a number for each label. New labels are appended to the list of known labels."""
+    """Return a number for each label. Add new labels to the list of known labels."""
     texts, inverse = np.unique(labels.astype(str), return_inverse=True)
     place = {name: i for i, name in enumerate(known)}
     codes: list[int] = []
@@ -322,7 +322,7 @@ def _features(seen: GraphColumns, frame: NDArray[Any], node: NDArray[Any]) -> ND
 
 
 def _sorted(file: Path, names: list[str]) -> list[str]:
-    """Return names sorted alphabetically, after changing their numbers in a file accordingly."""
+    """Sort names alphabetically, and change their numbers in a file accordingly. Return the sorted names."""
     order = sorted(range(len(names)), key=names.__getitem__)
     place = np.zeros(len(names) + 1, np.int16)
     place[order] = np.arange(len(names))
@@ -334,7 +334,7 @@ def _sorted(file: Path, names: list[str]) -> list[str]:
 
 
 def _test(folder: Path, columns: _TensorColumns) -> None:
-    """Raise an error if the written column files of the graphs cannot be read again.
+    """Raise an error if the written columns of the graphs cannot be read again.
 
     Raises
     ------

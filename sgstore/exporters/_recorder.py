@@ -1,4 +1,4 @@
-"""Recorder of a live simulator run as one MCAP file: frames as OSI and exactly, the road map, sensor data.
+"""Recorder of a simulator run as one MCAP file: frames (as OSI, and exactly), road map and sensor data.
 
 Log times are simulation times; they join sensors and frames to the nanosecond. The file has a
 temporary name until it is finished; memory does not grow with its length.
@@ -34,10 +34,10 @@ if TYPE_CHECKING:
 
 TRUTH: Final = "ground_truth"
 MAP_TOPIC: Final = "ground_truth_map"
-"""Topics of the frames and of the road map, as used by other producers."""
+"""Names of the topics for the frames and the road map, as other producers use them."""
 
 FRAMES, FRAMES_SCHEMA = "sgstore/frames", "sgstore.Frame"
-"""Topic and schema of the exact frames, because OSI lacks some values."""
+"""Topic and message schema of the exact frames, which contain values that OSI lacks."""
 
 PROTOBUF: Final = "protobuf"
 _JSON_SCHEMA: Final = b'{"type": "object", "properties": {"timestamp": {"type": "object"}}}'

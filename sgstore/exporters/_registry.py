@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 
 
 GROUP: Final = plugins.EXPORTERS.group
-"""Group of entry points for formats of other packages."""
+"""Name of the Python entry point group for export formats of other packages."""
 
 Write = Callable[["Export", Path], "Sequence[WrittenClip | WrittenFile]"]
-"""Writes an export into an empty folder, verifies it with the format's own reader, and returns the files.
+"""Function that writes an export into an empty folder, reads it for verification, and returns the files.
 
 The exporter chooses file names but does not write the manifest. It may raise
 :class:`~sgstore.errors.ExportError`; then all its files are removed.
@@ -81,7 +81,7 @@ EXPORTERS: Final = (
     _of("lance"),
     _of("geojson", "crs"),
 )
-"""Built-in formats."""
+"""Built-in export formats."""
 
 
 def exporters() -> dict[str, Exporter]:

@@ -196,7 +196,7 @@ class RerunClip:
         self._write_graph(graph, places)
 
     def _clear_edges(self, graph: SceneGraph) -> None:
-        """Clear the lines of relations that have no edges in this frame."""
+        """Clear the drawn lines of relations that have no edges in this frame."""
         now = {self._path("world", "edges", relation) for _, relation, _, _ in graph.edges}
         for path in sorted(path for path in self.paths - now if path.startswith("world/edges/")):
             self._out.log(path, self._rerun.Clear(recursive=False))
@@ -213,7 +213,7 @@ class RerunClip:
             self._log(path, self._rerun.Transform3D(translation=one.place, quaternion=turn))
 
     def _write_graph(self, graph: SceneGraph, places: dict[int, Any]) -> None:
-        """Write the nodes and edges of a scene graph as a diagram: the ego in the middle, ahead is up."""
+        """Write a scene graph as a diagram. The ego is in the middle, and its front points up."""
         rerun = self._rerun
         known = [node for node in graph.nodes if places[node]]
         about = {} if graph.ego is None else graph.nodes.get(graph.ego, {})
@@ -273,11 +273,11 @@ class RerunClip:
 
 
 _SPREAD: Final = 8.0
-"""Units of the graph view per metre, so that names do not overlap."""
+"""Units of the graph view for each metre. They leave space for names."""
 
 
 def _axes_of(record: Mapping[str, Any]) -> str:
-    """Return the name of the coordinate axes of a sensor message (``frame_id``)."""
+    """Return the name of the coordinate axes (``frame_id``) of a sensor message."""
     header = record.get("header")
     held = header if isinstance(header, Mapping) else record
     return str(held.get("frame_id", ""))

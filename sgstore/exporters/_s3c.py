@@ -28,7 +28,7 @@ HEADER: Final = ("ds", "sg", "n_img", "t_id", "node1", "edge", "node2")
 GRAPHS: Final = "graphs.csv"
 LABELS: Final = "labels.csv"
 BY_ITSELF: Final = "RSV"
-"""Default abstraction."""
+"""Name of the default abstraction."""
 
 
 def write(export: Export, folder: Path) -> list[WrittenFile]:

@@ -29,7 +29,7 @@ VIDEO: Final = re.compile("26[45]|avc|hevc|av1|vp9", re.IGNORECASE)
 """Names of video formats."""
 
 MAX_POINTS: Final = 20_000_000
-"""Greatest number of points of a cloud."""
+"""Largest number of points in a point cloud."""
 
 _ROS: Final = dict(enumerate(("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"), 1))
 
@@ -38,7 +38,7 @@ _FOXGLOVE: Final = dict(enumerate(("u1", "i1", "u2", "i2", "u4", "i4", "f4", "f8
 _FOXGLOVE_WORDS: Final = (
     *("UNKNOWN", "UINT8", "INT8", "UINT16", "INT16", "UINT32", "INT32", "FLOAT32", "FLOAT64"),
 )
-"""Number types of points."""
+"""Names of the number types of Foxglove, indexed by their number."""
 
 _LAYOUTS: Final = {
     **dict.fromkeys(("mono8", "8uc1"), ("u1", 1, "")),
@@ -53,7 +53,7 @@ _LAYOUTS: Final = {
     "bgra16": ("u2", 4, "bgr"),
     **dict.fromkeys(("yuv422", "uyvy", "yuv422_yuy2", "yuyv"), ("u1", 2, "array")),
 }
-"""Encodings of pixels: type and number of their values; and the order reversed, or no PNG possible."""
+"""Pixel encoding → type and number of values; and the order in a PNG (reversed, or no PNG possible)."""
 
 _BAYER: Final = re.compile(r"bayer_[a-z]{4}(8|16)")
 

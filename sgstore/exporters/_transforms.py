@@ -32,9 +32,9 @@ if TYPE_CHECKING:
 
 EGO: Final = "ego"
 OWN_EGO: Final = "sgstore/ego"
-"""Axes of the ego; the second name is for recordings with their own transforms."""
+"""Names of the ego's coordinate axes. The second one is for recordings with their own transforms."""
 GLOBAL: Final = "global"
-"""The world axes, as named by converters of OSI."""
+"""Name of the world's coordinate axes in converters of OSI."""
 
 FORM: Final = "[PARENT:]CHILD=X,Y,Z[,YAW[,PITCH,ROLL]]"
 TOLD: Final = frozenset(
@@ -43,12 +43,12 @@ TOLD: Final = frozenset(
         *("tf2_msgs/msg/TFMessage", "tf2_msgs/TFMessage"),
     }
 )
-"""Schemas of transforms in recordings."""
+"""Names of message schemas for transforms in recordings."""
 
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """Constant position and rotation of a sensor relative to the ego, or of any axes relative to others.
+    """Constant position and rotation of a sensor relative to the ego, or of axes relative to other axes.
 
     Attributes
     ----------
@@ -141,7 +141,7 @@ class FrameTransforms:
             self._fixed.append(AxesTransform(AXES, GLOBAL, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
 
     def of(self, graph: SceneGraph) -> Iterator[AxesTransform]:
-        """Yield the positions and rotations for a frame; without an ego, only the constant ones."""
+        """Yield positions and rotations for a frame. Without an ego, yield only the constant ones."""
         about = graph.nodes.get(graph.ego) if graph.ego is not None else None
         if about is not None and "x" in about and "y" in about:
             yield _of_ego(about, self.ego)

@@ -18,14 +18,14 @@ if TYPE_CHECKING:
 # below.
 
 LAYOUT: Final = "layout.json"
-"""Its name in the folder of an export."""
+"""Name of the layout file in the folder of an export."""
 
 IMAGES: Final = ("CompressedImage", "CompressedVideo", "RawImage", "Image")
 
 CALIBRATIONS: Final = ("CameraCalibration", "CameraInfo")
 
 CLOUDS: Final = ("PointCloud", "PointCloud2", "LaserScan")
-"""Last words of schema names of point clouds."""
+"""Last parts of the schema names for point clouds."""
 
 
 def layout(channels: Sequence[ChannelCount], ego: str) -> str:
@@ -74,7 +74,7 @@ def _split(direction: str, first: Any, second: Any, share: int) -> dict[str, Any
 
 
 def _camera(image: str, calibrations: Sequence[str]) -> dict[str, Any]:
-    """Return the viewer panel of a camera, with a calibration topic of the same namespace."""
+    """Return the viewer panel of a camera, with the calibration topic in the same namespace."""
     place = image.rpartition("/")[0]
     beside = [topic for topic in calibrations if topic.rpartition("/")[0] == place]
     mode = {"imageTopic": image} | ({"calibrationTopic": beside[0]} if beside else {})

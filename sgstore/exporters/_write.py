@@ -1,4 +1,4 @@
-"""Export of clips from a store: the files and a manifest are written completely or not at all."""
+"""Export of clips from a store. Its files and manifest are written completely, or not at all."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from sgstore.query import Store
 
 _SEVERAL: Final = {"mounts": "mount", "channels": "channel"}
-"""Options that the command line has several times, with their names there."""
+"""Options that can be repeated on the command line → their name there."""
 
 
 def around_frames(
@@ -136,7 +136,7 @@ def write_export(
 
 
 def _written(exporter: Exporter, export: Export, folder: Path) -> list[WrittenClip | WrittenFile]:
-    """Run an exporter; its errors are raised with the name of the format."""
+    """Run an exporter. Its errors get the name of the format."""
     try:
         written: list[Any] = list(exporter.write(export, folder))
         odd = [one for one in written if not isinstance(one, WrittenClip | WrittenFile)]

@@ -60,9 +60,9 @@ _SIZES: Final = {
     "person": (0.6, 0.6, 1.75),
 }
 _SIZE: Final = (4.5, 1.8, 1.5)
-"""Default length, width and height; m."""
+"""Default length, width and height of an entity; m."""
 TOLERANCE: Final = 0.001
-"""Tolerance of positions in the verification; m."""
+"""Tolerance for positions when a written file is verified; m."""
 
 _ENTITIES: Final = """
 SELECT n.node_id, any_value(n.kind)::VARCHAR AS kind, bool_or(n.is_ego) AS is_ego,
@@ -104,7 +104,7 @@ class EntityTrack:
     speed: Numbers
 
     def stretches(self) -> Iterator[tuple[int, int]]:
-        """Yield the first and last index of each run of frames without a gap."""
+        """Yield the first and last index of each sequence of frames without a gap."""
         ends = np.flatnonzero(np.diff(self.row) > 1).tolist()
         yield from zip([0, *(end + 1 for end in ends)], [*ends, len(self.row) - 1], strict=True)
 
@@ -315,7 +315,7 @@ class Scenario:
                 xml.leaf("DeleteEntityAction")
 
     def _write_lights(self, xml: XmlWriter, *, alone: bool) -> None:
-        """Write the changes of traffic lights as scenario events.
+        """Write the state changes of traffic lights as scenario events.
 
         Without moving entities, a placeholder is added, because an act must not be empty.
         """
@@ -348,7 +348,7 @@ class Scenario:
         return EntityTrack(row, _origins(pose, actor.centre), speed)
 
     def _light(self, node: int) -> Iterator[tuple[int, str]]:
-        """Yield the changes of a traffic light: the frame index and the new state."""
+        """Yield the changes of a traffic light: index of the frame, and new state."""
         before = ""
         for frame_id, state in self._store.rows(_LIGHT, {**self._frames.bounds, "node": node}):
             if state != before:
@@ -362,7 +362,7 @@ def _some(names: Sequence[str]) -> str:
 
 
 def _unwrapped(heading: Numbers) -> Numbers:
-    """Return headings without jumps by full turns. Unknown headings stay unknown."""
+    """Return headings without jumps by full rotations. Unknown headings remain unknown."""
     known = np.isfinite(heading)
     out = heading.copy()
     out[known] = np.unwrap(heading[known])

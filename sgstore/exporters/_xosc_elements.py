@@ -35,7 +35,7 @@ CATEGORIES: Final = {
     "vegetation": "vegetation",
     "unknown": "none",
 }
-"""Kind → category; without signs and lights, which belong to the map."""
+"""Kind of entity → category in OpenSCENARIO. Signs and lights are missing, because they belong to the map."""
 
 _PEOPLE: Final = frozenset({"person", "animal"})
 
@@ -114,7 +114,7 @@ class XmlWriter:
 
 
 def _readable(text: str) -> str:
-    """Return a text without characters that XML forbids, and without ``$`` (scenario parameters)."""
+    """Return a text without characters that XML forbids, and without ``$``, which starts a parameter."""
     return "".join(c if c.isprintable() and c != "$" else "\N{REPLACEMENT CHARACTER}" for c in text)
 
 
@@ -215,7 +215,7 @@ def write_signal(xml: XmlWriter, ref: str, state: str) -> None:
 
 
 def write_when(xml: XmlWriter, time: float, name: str) -> None:
-    """Write a scenario condition that is true from a simulation time on."""
+    """Write a scenario condition that becomes true at a simulation time."""
     with (
         xml.element("ConditionGroup"),
         xml.element("Condition", name=name, delay="0", conditionEdge="none"),

@@ -40,7 +40,7 @@ _COLUMNS: Final = (
     *("node_type", "node_id", "node_feature", "edge_index", "edge_type"),
 )
 _MOST: Final = 64 << 20
-"""Greatest size of ``graphs.json``; bytes."""
+"""Maximum size of ``graphs.json``; bytes."""
 
 
 class GraphData:
@@ -315,7 +315,7 @@ class GraphDataset:
     def _hetero_data(
         self, graph: dict[str, NDArray[Any]], kind: NDArray[Any], relation: NDArray[Any]
     ) -> Any:
-        """Return a graph as ``HeteroData`` with all node types and triples, also empty ones, for batching."""
+        """Return a graph as ``HeteroData`` with all node types and triples, even empty ones, for batching."""
         made = self._data.HeteroData()
         tensor = self._torch.from_numpy
         own = np.zeros(len(kind), np.int64)
@@ -360,7 +360,7 @@ class GraphDataset:
 
 
 def _renumbered(own: list[str], wanted: list[str], folder: str | Path) -> NDArray[np.int64]:
-    """Return for each name of one list its index in another list."""
+    """Return, for each name of one list, its index in another list."""
     place = {name: i for i, name in enumerate(wanted)}
     missing = [name for name in own if name not in place]
     if missing:
