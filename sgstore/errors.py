@@ -62,7 +62,7 @@ class SgstoreError(Exception):
 
 
 _URL: Final = re.compile(r"(s3a?|gs|az|abfs|https?):/+(?=[^/])")
-"""Start of a URL. ``Path`` merges its two slashes."""
+"""Regular expression of the start of a URL. ``Path`` merges its two slashes."""
 
 
 def place_named(path: str | Path) -> str:
@@ -126,7 +126,7 @@ class TraceError(SgstoreError):
 
 
 INTERRUPTIONS: Final = ("Query interrupted", "KeyboardInterrupt", "INTERRUPT Error")
-"""Words in the error messages of DuckDB after an interruption."""
+"""Parts of DuckDB's error messages after an interruption."""
 
 
 _DISK_FULL: Final = "the disk is full; free space, and run it again"
@@ -135,7 +135,7 @@ FULL: Final = {
     errno.EDQUOT: _DISK_FULL,
     errno.EFBIG: "stopped at the limit of the file size (ulimit -f); raise it, or ask for less",
 }
-"""Error codes of a write without room, with their messages."""
+"""Error codes of a write without disk space → messages."""
 
 _REMEDIES: Final = {
     errno.EBUSY: "close the programs that use it, and run it again",
@@ -249,7 +249,7 @@ class StoreError(SgstoreError):
 
 
 def one_store_needed(collection: str | Path, why: str = "this reads one store") -> StoreError:
-    """Return the error for a collection in a place that needs a single store."""
+    """Return the error for a collection where a single store is required."""
     place = place_named(collection)
     return StoreError(
         f"{place}: a collection, and {why}: 'sgstore collection unpack {place} all.sgstore' makes one of it"
@@ -412,11 +412,11 @@ def _with_carets(reason: str, text: str, span: TextSpan | None, hint: str | None
 
 
 EXCERPT: Final = 160
-"""Longest part of a query line in a message; characters."""
+"""Largest length of a query line that an error message quotes; characters."""
 
 
 def _excerpt(line: str, start: int, length: int) -> tuple[str, str]:
-    """Return the text around an error, and a line of carets under it. Control characters become dots."""
+    """Return the text around an error, and a line with carets below it. Control characters become dots."""
     first = max(0, min(start - EXCERPT // 2, len(line) - EXCERPT))
     shown = line[first : first + EXCERPT]
     shown = "".join(c if c.isprintable() else " " if c.isspace() else "·" for c in shown)

@@ -1,1 +1,1 @@
-"""General tools without knowledge of driving: files, logs, quoting, markup, geometry, plugins, processes."""
+"""General tools that know nothing of driving: files, logs, quoting, markup, geometry, plugins, processes."""

@@ -15,10 +15,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
 IN_NOTEBOOK: Final = 20
-"""Number of result rows shown in a notebook."""
+"""Number of result rows that a notebook shows."""
 
 LONGEST: Final = 200
-"""Longest value in a table cell; characters."""
+"""Largest length of a value in a table cell; characters."""
 
 _CELL: Final = "text-align:{align};padding:0.15em 0.8em;white-space:pre-wrap"
 
@@ -103,16 +103,16 @@ def html_media(data: bytes, kind: str, text: str = "") -> str:
 
 
 STORE_TEXT: Final = 80
-"""Longest text of a store in a message; characters."""
+"""Largest length of a text from a store in a message; characters."""
 
 
 def excerpt(text: Any) -> str:
-    """Return a text of a store for a message: one line of at most :data:`STORE_TEXT` characters."""
+    """Return a text from a store for a message: one line of at most :data:`STORE_TEXT` characters."""
     return cell(str(text)[: 4 * STORE_TEXT], STORE_TEXT)
 
 
 def excerpts(names: Sequence[str], most: int = 8) -> str:
-    """Return the first names of a store for a message, and the number of the others."""
+    """Return the first names from a store for a message, and the number of the others."""
     return first_of([*map(excerpt, names[:most]), *names[most:]], most)
 
 

@@ -101,7 +101,7 @@ def is_simple(corners: Sequence[Corner]) -> bool:
 
 
 def _meet(one: tuple[Corner, Corner], other: tuple[Corner, Corner]) -> bool:
-    """Return True if two sides of a polygon have a common point."""
+    """Return True if two sides of a polygon have a point in common."""
     ends = ((*one, other[0]), (*one, other[1]), (*other, one[0]), (*other, one[1]))
     turns = [_turn(*three) for three in ends]
     if turns[0] * turns[1] < 0 and turns[2] * turns[3] < 0:
@@ -115,7 +115,7 @@ def _is_between(a: Corner, b: Corner, c: Corner) -> bool:
 
 
 def _is_ahead(a: Corner, b: Corner, c: Corner) -> bool:
-    """Return True if the way from b to c continues the way from a to b."""
+    """Return True if the line from b to c continues straight in the direction from a to b."""
     return (b[0] - a[0]) * (c[0] - b[0]) + (b[1] - a[1]) * (c[1] - b[1]) > 0
 
 

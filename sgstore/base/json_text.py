@@ -21,7 +21,7 @@ def json_text(value: object, word: Callable[[float], str | None] = lambda _: Non
 
 
 def finite(value: Any, word: Callable[[float], str | None] = lambda _: None) -> Any:
-    """Convert a value to JSON types. Infinite numbers and NaN are replaced by ``word(number)``.
+    """Convert a value to JSON types. ``word(number)`` replaces infinite numbers and NaN.
 
     Parameters
     ----------

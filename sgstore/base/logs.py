@@ -14,7 +14,7 @@ __all__ = ["logger"]
 
 
 class _Logger:
-    """Logger for one topic, such as ``sgstore.store``, created at its first message.
+    """Logger for one topic, such as ``sgstore.store``. It is created at its first message.
 
     A program that listens has imported ``logging``. Otherwise sgstore does not import it.
     """
@@ -24,7 +24,7 @@ class _Logger:
         self._logger: Any = None
 
     def debug(self, text: str, *values: object) -> None:
-        """Log one step of the work, for the analysis of slow runs and wrong results."""
+        """Log a single step, to analyse slow runs and wrong results."""
         self._tell("debug", text, values)
 
     def info(self, text: str, *values: object) -> None:

@@ -17,12 +17,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 MAX_CHARACTERS: Final = 64 << 20
-"""Greatest length of the text of a map. Towns have a few million characters."""
+"""Largest length of the text of a map; characters. Towns have a few million."""
 MAX_MAP_ELEMENTS: Final = 1_500_000
-"""Greatest number of elements of a map; an element takes up to a kilobyte of memory."""
+"""Largest number of elements in a map. An element takes up to a kilobyte of memory."""
 MAX_DEPTH: Final = 64
 _EARLY: Final = r"\s*(?:<!--(?s:.*?)-->\s*)*(?=<\?xml\s)"
-"""Space and comments before the XML declaration, which some editors write."""
+"""Regular expression of spaces and comments before the XML declaration, which some editors write."""
 MAX_ATTRIBUTES: Final = 64
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     Loop = TypeVar("Loop", bound=Callable[..., Any])
 
 WORTH: Final = 25_000_000
-"""Ordered pairs of bodies before a process uses loops: 15,600 frames of 40 bodies, 2,500 of 100."""
+"""Pairs of bodies after which compiled loops save time: 15,600 frames of 40 bodies, 2,500 of 100."""
 
 _seen: dict[str, float] = {"pairs": 0, "enough": WORTH}
 
@@ -35,7 +35,7 @@ def worth() -> bool:
 
 
 def use_loops(after: float = WORTH) -> bool:
-    """Use compiled loops after a number of pairs of objects. Return True if numba is installed."""
+    """Use compiled loops after some number of pairs of objects. Return True if numba is installed."""
     _seen.update(pairs=0, enough=after)
     return _numba() is not None
 

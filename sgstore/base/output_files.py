@@ -33,10 +33,10 @@ FILE_PREFIX: Final = ".sgstore-held-"
 _DESCRIPTOR: Final = re.compile(r"/dev/fd/(\d+)|/proc/self/fd/(\d+)")
 
 _NOT_REPLACEABLE: Final = {errno.EACCES, errno.EPERM, errno.EROFS, errno.EBUSY, errno.EXDEV}
-"""Errors of a place in which a file is writable but not replaceable."""
+"""Error codes for places in which a file can be written, but not replaced."""
 
 BIDIRECTIONAL: Final = (0x61C, 0x200E, 0x200F, *range(0x202A, 0x202F), *range(0x2066, 0x206A))
-"""Characters that change the direction of the text around them, so that it reads as another text."""
+"""Characters that change the direction of the text around them, so that it looks like another text."""
 
 _CONTROLS: Final = {
     code: f"\\x{code:02x}" for code in (*range(0x20), *range(0x7F, 0xA0)) if chr(code) not in "\n\t"
@@ -52,7 +52,7 @@ def without_controls(text: str) -> str:
 
 
 class ReaderGoneError(ExportError):
-    """Error: the reading program closed the output pipe, as ``head`` does. The work can stop."""
+    """Error: the program that reads the output pipe has ended, as ``head`` does. The work can stop."""
 
 
 class Stream(io.RawIOBase):
@@ -121,7 +121,7 @@ class Stream(io.RawIOBase):
         return size
 
     def close(self) -> None:
-        """Close the stream. A network file system may report a full disk only now."""
+        """Close the stream. On a network file system, an error about a full disk may occur only now."""
         if self.closed:
             return
         super().close()
@@ -176,7 +176,7 @@ class OutputFile:
             return self._stack.enter_context(working_folder("output"))
 
     def path(self) -> Path:
-        """Return a temporary path for the content. :meth:`keep` moves this file to its final path."""
+        """Return a temporary path for the content. :meth:`keep` moves the file to its final path."""
         if self._path is None:
             with _export_errors(self._to):
                 self._path = self._stack.enter_context(working_folder("output")) / "output"
@@ -238,7 +238,7 @@ class OutputFile:
 
 @contextmanager
 def _complete(to: str | Path) -> Generator[OutputFile]:
-    """Context manager that yields an output file. It is kept at the end, or discarded after an exception."""
+    """Context manager with an output file. It is kept at the end, or discarded after an exception."""
     output = OutputFile(to)
     try:
         yield output
@@ -249,7 +249,7 @@ def _complete(to: str | Path) -> Generator[OutputFile]:
 
 @contextmanager
 def written(to: str | Path) -> Generator[BinaryIO]:
-    """Context manager that yields a byte stream. The file appears complete at the end, or not at all.
+    """Context manager with a byte stream. At the end, the file appears completely, or not at all.
 
     Raises
     ------
@@ -274,7 +274,7 @@ def written_text(to: str | Path) -> Generator[TextIO]:
 
 @contextmanager
 def written_at(to: str | Path) -> Generator[Path]:
-    """Context manager that yields a temporary path. The file moves to its final path at the end.
+    """Context manager with a temporary path. At the end, the file moves to its final path.
 
     Raises
     ------
@@ -286,7 +286,7 @@ def written_at(to: str | Path) -> Generator[Path]:
 
 
 def write_bytes(to: str | Path, data: bytes) -> None:
-    """Write a whole file atomically: it appears complete or not at all.
+    """Write a file atomically: it appears completely, or not at all.
 
     Raises
     ------
@@ -309,7 +309,7 @@ def _export_errors(to: Path) -> Generator[None]:
 
 
 def _target(to: Path) -> Path | None:
-    """Return the file that the output replaces, with links resolved. ``None``: a pipe or open stream."""
+    """Return the file that the output replaces, with links resolved. ``None`` means a pipe or open stream."""
     try:
         about = to.stat()
     except FileNotFoundError:
@@ -324,7 +324,7 @@ def _target(to: Path) -> Path | None:
 
 
 def _open_here(to: Path, about: os.stat_result) -> int | None:
-    """Return the open file descriptor for a name such as ``/dev/stdout``, or ``None``."""
+    """Return the open file descriptor that a name such as ``/dev/stdout`` refers to, or ``None``."""
     named = _DESCRIPTOR.fullmatch(str(to))
     if named:
         return int(named[1] or named[2])
@@ -364,7 +364,7 @@ def _copy(content: Path, to: Path, name: str) -> None:
 
 
 def _reserve(descriptor: int, before: int, size: int) -> None:
-    """Reserve the space of a longer content; without room, the file keeps its size and raises an error."""
+    """Reserve disk space for a longer content. Without space, keep the size of the file and raise an error."""
     if size <= before or not hasattr(os, "posix_fallocate"):
         return
     try:

@@ -64,7 +64,7 @@ class Registry:
         return self._loaded[name]
 
     def load_other(self, entry: EntryPoint, error: type[SgstoreError]) -> Any:
-        """Import an extension of another package, and return it.
+        """Return an extension of another package, after importing it.
 
         Raises
         ------
@@ -78,7 +78,7 @@ class Registry:
             raise error(reason) from fault
 
     def every(self, error: type[SgstoreError]) -> Iterator[tuple[str, Any]]:
-        """Yield name and object of all extensions: those of sgstore first, then those of other packages."""
+        """Yield name and object of all extensions: first those of sgstore, then those of other packages."""
         for name in self.own:
             yield name, self.load(name)
         for name, entry in self.others().items():
@@ -106,7 +106,7 @@ READERS: Final = Registry(
     ),
     "flavour",
 )
-"""Flavours of recordings, in the order of their tests."""
+"""Readers of recordings by flavour, in the order in which they are tried."""
 
 RELATIONS: Final = Registry(
     "sgstore.relations",
@@ -139,7 +139,7 @@ RELATIONS: Final = Registry(
     ),
     "relation",
 )
-"""Relations. The first 24 are those of ``schema.sql``, in its order; new ones come after them."""
+"""Built-in relations by name. The first 24 have the order of ``schema.sql``; new relations come after them."""
 
 ABSTRACTIONS: Final = Registry(
     "sgstore.abstractions",
@@ -157,10 +157,10 @@ ABSTRACTIONS: Final = Registry(
     ),
     "abstraction",
 )
-"""Abstractions: functions from columns of graphs to labelled graphs."""
+"""Built-in abstractions by name. They are functions from graphs in columns to labelled graphs."""
 
 EXPORTERS: Final = Registry("sgstore.exporters", {}, "format")
-"""Formats of other packages; :data:`sgstore.exporters.EXPORTERS` lists those of this package."""
+"""Export formats of other packages. :data:`sgstore.exporters.EXPORTERS` has those of this package."""
 
 _VERBS: Final = (
     *("select", "prioritize", "criticality", "coverage", "diff"),
@@ -169,4 +169,4 @@ _VERBS: Final = (
 VERBS: Final = Registry(
     "sgstore.verbs", _in("apps", **{name: f"verbs:{name}" for name in _VERBS}), "verb"
 )
-"""Functions behind verbs of :class:`sgstore.query.StoreVerbs` that need packages above it."""
+"""Functions behind methods of :class:`sgstore.query.StoreVerbs`, in packages of higher layers."""

@@ -31,7 +31,7 @@ NEEDED: Final = (
     *("sgstore", "duckdb", "numpy", "mcap", "google/protobuf", "zstandard", "lz4", "isal"),
     *("shapely", "lark", "networkx", "typer"),
 )
-"""Packages that a child process imports, as folders."""
+"""Packages that a child process must import, as folders."""
 
 _START: Final = (
     "import importlib, json, sys\n"
@@ -89,7 +89,7 @@ class WorkerProcess:
         return self._process.poll() is None
 
     def send(self, request: Mapping[str, Any]) -> None:
-        """Send a request. If the process is dead, its last line reports it."""
+        """Send a request. Errors are ignored, because :meth:`WorkerPool.get` reports a dead process."""
         with suppress(OSError, ValueError):
             self._stdin.write(json.dumps(request).encode() + b"\n")
             self._stdin.flush()
@@ -99,7 +99,7 @@ class WorkerProcess:
         self._process.kill()
 
     def end(self) -> int:
-        """Kill the process if it still runs, and return its exit code."""
+        """Kill the process if it still runs. Return its exit code."""
         self._process.kill()
         code = self._process.wait()
         self._listener.join()
@@ -117,7 +117,7 @@ def _listen(lines: IO[bytes], longest: int, on_line: Callable[[bytes], object]) 
 
 
 class WorkerPool:
-    """Pool of equal worker processes that share requests. It is a context manager that ends the workers.
+    """Pool of equal worker processes that share requests. As a context manager, it ends the workers.
 
     A dead worker is replaced. Requests that it has not begun go to the other workers.
 
@@ -160,12 +160,12 @@ class WorkerPool:
 
     @property
     def has_room(self) -> bool:
-        """True if a worker process can take another request."""
+        """True if a worker process can receive another request."""
         least = min(map(len, self._given.values()), default=0)
         return len(self._workers) < self._count or least < self._ahead
 
     def put(self, key: int, request: Mapping[str, Any]) -> None:
-        """Send a request to the worker process with the fewest requests. Replies come with the given key."""
+        """Send a request to the worker process with the fewest requests. Its reply comes with the given key."""
         number = min(self._given, key=lambda one: len(self._given[one]), default=0)
         if len(self._workers) < self._count and self._given.get(number, True):
             number = self._start()
@@ -173,7 +173,7 @@ class WorkerPool:
         self._workers[number].send(request)
 
     def get(self) -> tuple[int, dict[str, Any] | int]:
-        """Return the next reply of any worker, with the key of its request; an exit code if the worker died."""
+        """Return the next reply and the key of its request; an exit code if the worker died."""
         while True:
             number, line = self._lines.get()
             given = self._given[number]

@@ -49,7 +49,7 @@ def _chained(parts: list[Any]) -> Any:
 
 
 def ascending(numbers: NDArray[np.int64]) -> NDArray[np.intp]:
-    """Return the stable sort order of non-negative integers (indices that sort them)."""
+    """Return the indices that sort non-negative integers; equal integers keep their order."""
     order = np.argsort(numbers.astype(np.uint16), kind="stable")
     for shift in range(16, int(numbers.max(initial=0)).bit_length(), 16):
         digits = (numbers[order] >> shift).astype(np.uint16)
@@ -67,7 +67,7 @@ def begins(*columns: NDArray[Any]) -> NDArray[np.bool_]:
 def spread(
     starts: NDArray[np.int64], counts: NDArray[np.int64]
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Expand index ranges (start, count): return the range number and the index of each element.
+    """Expand index ranges (start, count). Return for each element the number of its range and its index.
 
     Returns
     -------
@@ -80,7 +80,7 @@ def spread(
 
 
 def components(count: int, one: NDArray[np.int64], other: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return, for each of ``count`` nodes, the smallest node that edges (one, other) connect it to."""
+    """Return the smallest node that is connected to each of ``count`` nodes by edges (one, other)."""
     least = np.arange(count)
     while True:
         before, low = least.copy(), np.minimum(least[one], least[other])

@@ -27,10 +27,10 @@ except ImportError:  # not on Windows: a folder in use cannot be removed there
 
 
 PREFIX: Final = "sgstore-held-"
-"""Prefix of process folders in the folder for temporary files."""
+"""Prefix of the names of process folders in the folder for temporary files."""
 
 _UNLOCKED: Final = ".unlocked"
-"""File in a folder that its process could not lock."""
+"""Name of a file that marks a folder whose process could not lock it."""
 
 _FLAGS: Final = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_NOFOLLOW", 0)
 
@@ -97,7 +97,7 @@ class HeldFolder:
         return False
 
     def _marked(self) -> bool:
-        """Mark the folder, so that no process removes it. Return False if a process has removed it."""
+        """Mark the folder, so that no process removes it. Return False if another process has removed it."""
         try:
             (self.path / _UNLOCKED).touch()
         except FileNotFoundError:
@@ -156,11 +156,11 @@ def sweep_temporary() -> None:
 
 
 _mine: dict[tuple[int, Path], Path] = {}
-"""Folder of each process: (process id, folder for temporary files) → path."""
+"""Folders that exist for this process: (process id, folder for temporary files) → path."""
 
 
 def temporary_folder() -> Path:
-    """Return this process's folder for data that exceed memory. It is removed at exit.
+    """Return the folder of this process for data that do not fit into memory. It is removed at exit.
 
     If the creation fails, the folder does not exist, and later writes raise an error.
     """
