@@ -82,39 +82,39 @@ _TRACE_ID: Final = TraceAttribute(TRACE_ATTRIBUTES["id"], Type.number)
 _SEQ: Final = FrameAttribute(FRAME_ATTRIBUTES["seq"], Type.number)
 
 SHOWN: Final = 80
-"""Maximum length of the query text in the repr of matches; characters."""
+"""Largest length of the query text in ``repr()`` of the matches; characters."""
 
 FIRST_WINDOW: Final = 1024
-"""Buckets of the first window: 61,440 frames, about 30 ms for real traffic. The caller may stop early."""
+"""Buckets in the first window: 61,440 frames, about 30 ms. It is small, as the caller may stop early."""
 
 
 GROWTH: Final = 16
-"""Growth factor of windows after a window with few rows."""
+"""Factor by which a window grows if the previous window had few rows."""
 
 LAST_WINDOW: Final = 16_384
-"""Buckets of the largest window, and of the first window for a call of all rows: a million frames."""
+"""Buckets in the largest window: about a million frames. A call for all rows begins with this size."""
 
 COUNTED: Final = 16_384
-"""Largest store, in buckets, whose matching frames a notebook counts automatically: a million frames."""
+"""Largest store whose matching frames a notebook counts automatically: about a million frames; buckets."""
 
 PICTURES: Final = 4
-"""Number of pictures below the matches in a notebook, and of the frames searched for them."""
+"""Number of pictures that a notebook shows below the matches, and of frames that are searched for them."""
 LOOKED_AT: Final = 2_000
 
 ROWS: Final = 1_000_000
-"""Target number of rows per window. Windows grow after few rows and shrink after many."""
+"""Desired number of rows in a window. Windows grow if they have fewer rows, and shrink if they have more."""
 
 KEPT: Final = 10_000
-"""Largest number of rows that matches keep after their number was asked."""
+"""Largest number of rows that are cached after a call of ``len()``."""
 
 BLOCK: Final = 50_000
-"""Multi-frame matches inserted into the database at once."""
+"""Number of multi-frame matches that are inserted into the database at once."""
 T = TypeVar("T")
 
 if TYPE_CHECKING:
 
     class Row(tuple[Any, ...]):
-        """Result row, as seen by a type checker: a named tuple with one field per query column."""
+        """Result row for type checkers: a named tuple with one field for each column."""
 
         def __getattr__(self, name: str) -> Any: ...
 
@@ -313,7 +313,7 @@ class Matches(Tabular):
 
     @contextmanager
     def _compiled(self) -> Generator[Compiled]:
-        """Yield the query compiled for the current store. The store cannot change inside the block.
+        """Yield the query compiled for the current store. Inside the block, the store cannot change.
 
         The content of a store affects the SQL, so a change of the file requires a new compilation.
         """
@@ -337,7 +337,7 @@ class Matches(Tabular):
 
     @property
     def mistakes(self) -> tuple[str, ...]:
-        """Part of :attr:`notes` that needs no second search if nothing matches.
+        """Notes among :attr:`notes` that need no second search if the query has no matches.
 
         Examples
         --------
@@ -356,7 +356,7 @@ class Matches(Tabular):
             return compiled.bound.doubts + texts + unknown_in_or(compiled.bound, ask)
 
     def _absent(self, compiled: Compiled) -> tuple[str, ...]:
-        """Return a note on a part of the pattern that no frame of the store has, if nothing matches."""
+        """Return a note on a part of the pattern that no frame has. It is empty if the query has matches."""
         if self._some or len(compiled.reasons) == len(compiled.chosen):
             return ()
         from sgstore.lang.help import absent_part
@@ -372,7 +372,7 @@ class Matches(Tabular):
         return next(rows, None) is not None
 
     def nearest(self) -> dict[str, Any]:
-        """Return the frame that comes nearest to a pattern without matches.
+        """Return the frame that comes closest to a pattern without matches.
 
         Returns
         -------
@@ -442,7 +442,7 @@ class Matches(Tabular):
         return self._rows(whole=False) if kept is None else iter(kept)
 
     def _kept_rows(self) -> list[Row] | None:
-        """Return the rows that were kept, if the store has not changed since."""
+        """Return the cached rows, if the store has not changed since they were read."""
         if self._kept is None or self._kept[0] is not self._catalog():
             return None
         return self._kept[1]
@@ -568,7 +568,7 @@ class Matches(Tabular):
         return [{n: row[i] for i, n in names.items() if row[i] is not None} for row in found]
 
     def parts(self, frame: FrameRef, binding: Mapping[str, int] | None = None) -> TruthLanes:
-        """Return the intervals in which each part of the pattern holds, for one binding.
+        """Return the frames in which each part of the pattern is true, for one binding.
 
         See :meth:`sgstore.Store.parts`.
 
@@ -753,7 +753,7 @@ class Matches(Tabular):
             return ParquetTable.write_batches((columns, found), Path(path), self.columns)
 
     def _record_batches(self) -> Generator[Any]:
-        """Yield the columns, then the rows in Arrow batches.
+        """Yield the columns first, and then the rows in Arrow batches.
 
         Yield nothing if Arrow and Python values would differ.
         """
@@ -776,7 +776,7 @@ class Matches(Tabular):
                             return
 
     def as_table(self, name: str, *, apart: bool = False) -> list[Given]:
-        """Return the steps that create a temporary table of all rows under the given name.
+        """Return the SQL steps that create a temporary table with all rows.
 
         ``apart``: add columns that distinguish equal node ids of different traces.
 
@@ -877,7 +877,7 @@ class Matches(Tabular):
         *,
         whole: bool = False,
     ) -> Iterator[tuple[SqlStatement, Windows]]:
-        """Yield one statement per window. The caller must add the number of rows to ``Windows.rows``."""
+        """Yield a statement for each window. The caller must add its number of rows to ``Windows.rows``."""
         result, form = compiled.query.result, form or compiled.query.result.form
         at_once = form == result.form and not compiled.in_windows
         windows = Windows(
@@ -890,7 +890,7 @@ class Matches(Tabular):
                 yield one, windows
 
     def _asked(self, statement: SqlStatement) -> dict[str, Any]:
-        """Return the arguments of :class:`StoreFile` methods: the last SQL step, and the tables it needs.
+        """Return the arguments for a query of :class:`StoreFile`: the last SQL step and its temporary tables.
 
         The tables are external matches, and results of earlier steps.
         """
@@ -1023,7 +1023,7 @@ class UnionMatches(Matches):
             yield one
 
     def _joined(self) -> dict[str, Any]:
-        """Return the arguments of :class:`StoreFile` methods for all rows.
+        """Return the arguments for a query of :class:`StoreFile` for all rows of the union.
 
         Each part becomes a temporary table.
         """
@@ -1133,7 +1133,7 @@ def _begin(interval: Interval) -> tuple[Any, int]:
 
 
 class _LazyRows:
-    """Iterator of the rows of matches. The search begins with the first row.
+    """Iterator over the rows of matches. The search starts when the first row is read.
 
     Parameters
     ----------
@@ -1154,7 +1154,7 @@ class _LazyRows:
         return next(self._rows)
 
     def take(self, rows: Iterable[Row]) -> int | None:
-        """Take the rows of another search before the own search begins; return their number, or None."""
+        """Use the rows of another search, if this search has not started. Return their number, or None."""
         if self._rows is not None:
             return None
         found = list(rows)
@@ -1163,18 +1163,18 @@ class _LazyRows:
 
 
 class TooMuchError(QueryError):
-    """A query needs more memory for one window than allowed. A smaller set of traces may work."""
+    """Error: a query needs too much memory for one window. A smaller set of traces may work."""
 
 
 @lru_cache(maxsize=64)
 def row_type(columns: tuple[str, ...]) -> Any:
-    """Return a named tuple class for rows. A column without a valid field name gets a numbered name."""
+    """Return a named tuple class for rows. Columns with an invalid field name get a numbered name."""
     names = [re.sub(r"\W+", "_", name).strip("_") for name in columns]
     return namedtuple("Row", names, rename=True)  # pyright: ignore[reportUntypedNamedTuple]
 
 
 class Windows:
-    """Iterator of bucket ranges for a search, trace by trace.
+    """Iterator over ranges of buckets, for a search through one trace after another.
 
     A small store yields only ``None``: all buckets.
 
@@ -1226,7 +1226,7 @@ class Windows:
             yield from self._told(group, used)
 
     def parts(self, window: Window | None, ask: Callable[[Window | None], T]) -> Iterator[T]:
-        """Yield the result for a range. If it is too large, split the range into halves and repeat.
+        """Yield the result of ``ask`` for a range. If it is too large, divide the range in two and repeat.
 
         Raises
         ------
@@ -1265,7 +1265,7 @@ class Windows:
 def intervals_for_people(
     intervals: Iterable[Interval],
 ) -> tuple[tuple[str, ...], Iterator[tuple[Any, ...]]]:
-    """Return readable columns and rows of intervals: first frame as ``trace#seq``, variables as their names.
+    """Return readable columns and rows of intervals, with the first frame as ``trace#seq`` and names of nodes.
 
     Returns
     -------

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 
 class StoreFrame:
-    """Frame of a store: its scene graph and its sensor messages. Notebooks show it as a bird's-eye view.
+    """Frame of a store: its scene graph and its sensor messages. Notebooks draw it in bird's-eye view.
 
     Attributes
     ----------
@@ -183,7 +183,7 @@ class ClipAnimation:
 
 
 class StoreVerbs:
-    """Verbs of a store or a collection, with the words of the command line.
+    """Methods that a store and a collection share, named as the commands of the command line.
 
     The signatures and docstrings are the table of verbs: the command line and the tools of assistants take
     names, defaults and help of their options from here.
@@ -193,7 +193,7 @@ class StoreVerbs:
     """
 
     def _run(self, verb: str, given: dict[str, Any]) -> Any:
-        """Run the function of a verb with the arguments of its method."""
+        """Run the function of a command with the arguments of a method."""
         store = given.pop("self")
         return VERBS.load(verb)(store, **given)
 
@@ -311,7 +311,7 @@ class StoreVerbs:
         learn_from: str | Path | Store | None = None,
         parameters: Mapping[str, object] | None = None,
     ) -> Any:
-        """Order frames, clips or traces so that tests find failures soon, with reasons.
+        """Order frames, clips or traces so that tests find failures early, with a reason for each place.
 
         Parameters
         ----------
@@ -360,7 +360,7 @@ class StoreVerbs:
         return self._run("prioritize", locals())
 
     def criticality(self, *, measures: Sequence[str] = (), most: float | None = None) -> Any:
-        """List measures of recorded encounters of two entities: PET, TET, CPI, the closest encounter.
+        """List criticality measures of recorded encounters: PET, TET, CPI and the smallest distance.
 
         Parameters
         ----------
@@ -531,7 +531,7 @@ class StoreVerbs:
         to: str | Path | None = None,
         parameters: Mapping[str, object] | None = None,
     ) -> Any:
-        """Return lanes of matches and rule violations over time, one lane per entity, for each trace.
+        """Return matches and rule violations over time for each trace: one lane for each entity.
 
         Parameters
         ----------
@@ -738,7 +738,7 @@ class StoreVerbs:
         payloads: bool | None = None,
         strict: bool = False,
     ) -> Any:
-        """Verify that a store has not changed since it was published; or that it has the cases of a lock.
+        """Verify that a store is unchanged since publication, or that it contains the cases of a lock.
 
         Parameters
         ----------
@@ -1231,7 +1231,7 @@ class Store(StoreVerbs):
         return Example.find(self.file, example, limit, each_trace=each_trace)
 
     def pattern(self, frame: int | str | FrameRef, *, ignore: Sequence[str] = ()) -> str:
-        """Return a pattern text that describes a frame around its ego and matches this frame.
+        """Return a pattern that describes the surroundings of the ego in a frame, and that matches this frame.
 
         Parameters
         ----------
@@ -1514,7 +1514,7 @@ class Store(StoreVerbs):
     def why_not(
         self, frame: int | str | FrameRef, text: str, /, **parameters: object
     ) -> WhyNot | WhyNotSteps:
-        """Explain why a pattern does not match a frame: the first condition that fails, and by how much.
+        """Explain why a pattern does not match a frame: the first false condition, and how much it fails by.
 
         Parameters
         ----------
@@ -1576,7 +1576,7 @@ class Store(StoreVerbs):
         /,
         **parameters: object,
     ) -> TruthLanes:
-        """Return the intervals in which each part of a pattern holds, over the whole trace, for one binding.
+        """Return the frames in which each part of a pattern is true, over the whole trace, for one binding.
 
         The binding matches in the frames in which all parts hold. For a sequence, this applies to each step.
 
@@ -1615,7 +1615,7 @@ class Store(StoreVerbs):
     def _nearest(
         self, ref: FrameRef, text: str, parameters: Mapping[str, object]
     ) -> dict[str, int]:
-        """Return the binding that comes nearest to a match in a frame: variable name → node id."""
+        """Return the binding that comes closest to a match in a frame: variable name → node id."""
         why: Any = self.why_not(ref, text, **parameters)
         ids = {
             str(about.get("name", node)): node
@@ -1629,7 +1629,7 @@ class Store(StoreVerbs):
         return found
 
     def _view(self, frame: FrameRef, query: Query) -> FrameView:
-        """Return a frame for evaluation in memory, with the store values that the query needs."""
+        """Return a frame for evaluation in memory, including the values that the query needs from the store."""
         from sgstore.lang.help import events_in, looked_up
         from sgstore.lang.memory import FrameView
         from sgstore.model.world import seconds_of

@@ -89,7 +89,7 @@ if TYPE_CHECKING:
 
 
 _OTHER_EDGES: Final = 8
-"""Edges per body, without the edges of pairs, that the initial table can hold."""
+"""Number of edges per object for which the initial table has space, without edges between objects."""
 
 
 class SceneGraphGenerator:
@@ -217,10 +217,10 @@ class SceneGraphGenerator:
         return pieces(frames, kinds, self._config, egos)
 
     def recorded(self, blocks: Iterable[FrameBlock]) -> Iterator[FrameBlock]:
-        """Yield the blocks of a recording with the lanes that its vehicles drive in junctions.
+        """Yield the blocks of a recording with the chosen lanes of its vehicles in junctions.
 
-        The lane of a passage is known after its last frame. Blocks are held back until then. Ingest uses this
-        method. Without it, the footprints of a single frame decide the primary lanes.
+        The lane in a junction is known only after the vehicle has left the junction, so blocks are held back
+        until then. Ingest uses this method. Without it, each frame alone decides the primary lanes.
 
         Examples
         --------
@@ -339,7 +339,7 @@ class SceneGraphGenerator:
     def _counted(
         self, frames: FrameBlock, named: Bools, drawn: int, beyond: _Beyond | None
     ) -> LeftOut:
-        """Count the states that the graphs leave out, by reason."""
+        """Count the object states that are not in the graphs, by reason."""
         kind = self._kinds[frames.states.node]
         wanted = self._wanted(frames.states.node, kind) | named
         known = 0 if beyond is None else len(beyond.frames.states)
@@ -352,7 +352,7 @@ class SceneGraphGenerator:
         )
 
     def _wanted(self, node: Ints, kind: Codes) -> Bools:
-        """Return a mask of the states whose entities the settings do not exclude."""
+        """Return a mask of the object states that the settings do not exclude."""
         return self._keeping.entities(kind) & ~self._left_out[node]
 
     def _beyond(self, frames: FrameBlock, poses: EgoPoses, outer: Extent, keys: Ints) -> _Beyond:
@@ -368,7 +368,7 @@ class SceneGraphGenerator:
         return _Beyond(_reduced(frames, kept), areas, others)
 
     def _world(self, frames: FrameBlock, keys: Ints, every: Ints) -> _World:
-        """Compute the results that all egos share: bodies, pairs, contacts and lanes.
+        """Return the known entities around the graphs of one ego. ``keys`` are the rows inside the graphs.
 
         ``keys`` are the rows in the graphs, ``every`` also those of the surroundings.
         """
@@ -422,7 +422,7 @@ class SceneGraphGenerator:
         return gathered(chunks, bodies.frame, frames)
 
     def _of_view(self, view: _View, world: _World) -> _World:
-        """Return the shared results for the range of one ego.
+        """Return the shared results, reduced to the range of one ego.
 
         A frame may be too crowded for all egos together, but not for this one. Its pairs are then
         computed again.
@@ -479,7 +479,7 @@ class SceneGraphGenerator:
     def _world_of(
         self, view: _View, whole: _World | None, ground: MapContext | None, edges: Edges
     ) -> WorldBlock | None:
-        """Return the surroundings of one ego's graphs: known entities outside the graphs, but near the ego."""
+        """Return the surroundings of one ego's graphs: known entities near the ego, but outside the graphs."""
         beyond = view.beyond
         if beyond is None or whole is None:
             return None
@@ -503,7 +503,7 @@ class SceneGraphGenerator:
     def _beyond_edges(
         self, bodies: Bodies, around: MapContext | None, edges: Edges
     ) -> tuple[Edges, LaneGaps]:
-        """Return the edges that change if the surroundings are added, and the gaps of the additional edges."""
+        """Return the edges that change if entities outside the graphs are added, and the gaps of new edges."""
         if around is None:
             return Edges.chained([]), gaps(bodies, None)
         none = np.zeros(0, np.intp)
@@ -523,14 +523,14 @@ class SceneGraphGenerator:
 
     @classmethod
     def _of_the_past(cls, road_map: RoadMap | None, config: Config) -> SceneGraphGenerator:
-        """Return a generator whose driven lanes follow from earlier frames alone."""
+        """Return a generator that chooses driven lanes from earlier frames alone, as in online mode."""
         generator = cls(road_map, config)
         if generator._survey is not None:
             generator._survey.online = True
         return generator
 
     def _refuse_undeclared(self, edges: Edges) -> None:
-        """Raise if another package returns undeclared edges, which the store cannot hold."""
+        """Raise an error if a relation of another package returns edges that it does not declare."""
         names = [tuple(RELATIONS)[code] for code in np.unique(edges.relation)]
         strange = sorted({*names} - {*self.answers} - {*OWN_RELATIONS})
         if strange:
@@ -543,7 +543,7 @@ class SceneGraphGenerator:
     def _crowded(
         self, bodies: Bodies, over: Mapping[str, Bools]
     ) -> tuple[tuple[str, int, int], ...]:
-        """Return the frames with too many pairs and their number of bodies, if pairs are needed."""
+        """Return the frames with too many pairs and their number of objects, if a relation needs the pairs."""
         found: list[tuple[str, int, int]] = []
         for what, frames in over.items():
             wanted = {"overlaps"} if what == TOUCHING else self._of_pairs
@@ -722,7 +722,7 @@ class SceneGraphGenerator:
         return self._kinds
 
     def _learn(self, frames: FrameBlock) -> FrameBlock:
-        """Store the new entities and scenery of a block.
+        """Store the new entities and static objects of a block.
 
         Return the block with the carriers of carried entities.
         """
@@ -752,7 +752,7 @@ class SceneGraphGenerator:
         return replace(frames, states=replace(frames.states, carrier=carrier))
 
     def _scenery_in_range(self, areas: Areas) -> Ints:
-        """Return the scenery in range, numbered frame by frame. Without an ego, all scenery is in range."""
+        """Return the static objects in range, frame by frame. Without an ego, all are in range."""
         scenery = self._scenery
         if not len(scenery):
             return np.zeros(0, np.int64)
@@ -887,14 +887,14 @@ def _united(keys: Sequence[Ints]) -> Ints:
 
 
 def _in_ascending(keys: Ints, some: Ints) -> Bools:
-    """Return a mask of the values that occur in the ascending ``keys``."""
+    """Return a mask of the values that occur in the ascending array ``keys``."""
     if not len(keys):
         return np.zeros(len(some), np.bool_)
     return keys[np.minimum(np.searchsorted(keys, some), len(keys) - 1)] == some
 
 
 def _reduced(frames: FrameBlock, kept: Rows) -> FrameBlock:
-    """Return the frames with only the given states."""
+    """Return the frames with only the given object states."""
     states = frames.states
     return replace(
         frames,
@@ -911,7 +911,7 @@ def _of_codes(edges: Edges, codes: tuple[int, ...]) -> Edges:
 
 
 def _rows_apart(one: Edges, other: Edges) -> tuple[Rows, Rows]:
-    """Return the rows of the edges that only the first table has, and of those that only the second has."""
+    """Return the rows of edges that only the first table has, and the rows that only the second has."""
     a, b = _keys(*((of.frame, of.relation, of.src, of.dst) for of in (one, other)))
     return (
         np.flatnonzero(~_in_ascending(np.sort(b), a)),
@@ -920,7 +920,7 @@ def _rows_apart(one: Edges, other: Edges) -> tuple[Rows, Rows]:
 
 
 def _keys(one: tuple[Whole | Codes, ...], other: tuple[Whole | Codes, ...]) -> tuple[Ints, Ints]:
-    """Return one number per row of two tables. Equal rows get equal numbers."""
+    """Return a number for each row of two tables. Equal rows have equal numbers."""
     keys = np.zeros(len(one[0]) + len(other[0]), np.int64)
     for columns in zip(one, other, strict=True):
         column = np.concatenate(columns, dtype=np.int64)
@@ -930,14 +930,14 @@ def _keys(one: tuple[Whole | Codes, ...], other: tuple[Whole | Codes, ...]) -> t
 
 
 def _among(place: Rows, pairs: tuple[Rows, Rows]) -> tuple[Rows, Rows]:
-    """Drop the pairs with a removed row, and return the other pairs with new row numbers."""
+    """Convert pairs to new row numbers. Drop the pairs with a removed row."""
     a, b = place[pairs[0]], place[pairs[1]]
     both = (a >= 0) & (b >= 0)
     return a[both], b[both]
 
 
 def _ego_rows(frames: FrameBlock) -> Rows:
-    """Return the row of the ego's state in each frame; -1 without a state or a position."""
+    """Return the row of the ego's state in each frame; -1 if the state or its position is missing."""
     states = frames.states
     rows = np.flatnonzero(states.node == np.repeat(frames.ego, np.diff(frames.offsets)))
     rows = rows[np.isfinite(states.x[rows]) & np.isfinite(states.y[rows])]
@@ -964,7 +964,7 @@ def _bottom(states: States) -> Floats:
 
 
 def _presence(bodies: Bodies, present: Bools | None) -> StaticPresence:
-    """Return the static nodes of the graphs: scenery and map nodes."""
+    """Return the static nodes of the graphs: static objects and map nodes."""
     still = np.flatnonzero(~bodies.moves)
     frame, column = np.nonzero(present) if present is not None else (still[:0], still[:0])
     return StaticPresence(
