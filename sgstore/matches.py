@@ -16,7 +16,7 @@ from functools import lru_cache, partial
 from heapq import merge
 from itertools import chain, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar, overload
 from weakref import ref
 
 from sgstore.base.display import IN_NOTEBOOK
@@ -377,9 +377,10 @@ class Matches(Tabular):
         Returns
         -------
         dict
-            ``failed``: the first part of the pattern that no frame has. ``trace``, ``seq`` and ``found``: a
-            frame that has all parts before it, and its value nearest to the limit, as text. They are missing
-            if the part compares no numbers. The result is empty if each part occurs.
+            ``failed``: the first part of the pattern that no frame has, as written. ``others``: the parts
+            before it, if frames have it without them. ``trace`` and ``seq``: a frame that has all parts
+            before it. ``found``: its value nearest to the limit, as text; it is missing if the part compares
+            no numbers. The result is empty if each part occurs.
 
         Examples
         --------
@@ -393,7 +394,8 @@ class Matches(Tabular):
             told = nearest_query(compiled.bound, partial(self._exists, compiled))
             if told is None:
                 return {}
-            failed, value, text = told
+            failed, others, value, text = told
+            about: dict[str, Any] = {"failed": failed} | ({"others": others} if others else {})
             using, values = self._settings()
             try:
                 rows = Matches(self._file, self._catalog, using + text, values) if text else ()
@@ -401,10 +403,10 @@ class Matches(Tabular):
             except QueryError:  # texts have no difference
                 rows = []
         for trace, seq, found in rows:
-            if found is not None:
-                shown = f"{value} = {found:.4g}"
-                return {"failed": failed, "trace": trace, "seq": seq, "found": shown}
-        return {"failed": failed}
+            if found is not None or not value:
+                shown = {"found": f"{value} = {found:.4g}"} if value else {}
+                return about | {"trace": trace, "seq": seq} | shown
+        return about
 
     def _settings(self) -> tuple[str, dict[str, object]]:
         """Return the settings of the query as text, and the values of their parameters."""
@@ -670,6 +672,57 @@ class Matches(Tabular):
             names = self._columns_of(compiled, form)[width:]
             for row in self._answered(form):
                 yield Interval(*row[:width], values=dict(zip(names, row[width:], strict=True)))
+
+    @property
+    def lists(self) -> Literal["matches", "chosen", "values"]:
+        """Content of the rows: all matches, chosen or ordered matches, or values of several matches.
+
+        Examples
+        --------
+        >>> [store.find(f"MATCH (e:Ego) {one}").lists for one in ("", "LIMIT 3", "RETURN COUNT(*)")]
+        ['matches', 'chosen', 'values']
+        """
+        result = self._ready.bound.result
+        chosen = result.chooses or result.order or result.sample
+        if result.groups or (result.form == "clips" and chosen):
+            return "values"
+        return "chosen" if chosen or result.form == "intervals" else "matches"
+
+    def listed(self) -> Iterator[Interval]:
+        """Yield the match of each row, in the order of the rows, with its binding and the values of ``RETURN``.
+
+        A row of a single frame gives an interval of one frame. Nothing is yielded for clips, and if
+        :attr:`lists` is ``values``.
+
+        Examples
+        --------
+        >>> text = "MATCH (e:Ego)-[:near_coll]->(v:Truck|Van) RETURN gap(e, v) AS gap ORDER BY gap LIMIT 2"
+        >>> for one in store.find(text).listed():
+        ...     print(one.trace, one.start_seq, one.values["v.name"], round(one.values["gap"], 4))
+        town 520 van 13 0.975
+        town 519 van 13 0.975
+        """
+        with self._compiled() as compiled:
+            ready = compiled.listed
+            if ready is None:
+                return
+            spans, limit = ready.query.result.form == "intervals", ready.query.result.limit
+            width = len(INTERVAL_COLUMNS if spans else FRAME_COLUMNS)
+            names = [  # a variable with the name of a column of the frame, such as t, has ".id" there
+                one.split(" ", 1)[1] if one[0] == ":" and " " in one else one.removesuffix(".id")
+                for one in ready.columns[width:]
+            ]
+            keep = [(n, name) for n, name in enumerate(names, width) if name[0] not in "#:"]
+            for row in islice(self._rows_of(self._statements(ready, Compiled.rows)), limit):
+                # A variable has precedence over a value of RETURN with its name.
+                values = dict[str, Any]()
+                for place, name in keep:
+                    values.setdefault(name, row[place])
+                if spans:
+                    yield Interval(*row[:width], values=values)
+                else:
+                    _, trace, seq, time_ns, t = row[:width]
+                    yield Interval(trace, seq, seq, time_ns, time_ns, t, t, 1, values)
 
     def clips(self, before: float = 0.0, after: float = 0.0) -> Iterator[Clip]:
         """Yield clips around the matching frames, in log time. Overlapping clips are merged.
@@ -1089,6 +1142,16 @@ class UnionMatches(Matches):
         with self._file.snapshot():
             parts = [self._in_time(part.intervals(bound=bound), _begin) for part in self._parts]
             yield from self._merged(parts, _begin, repr)
+
+    @property
+    def lists(self) -> Literal["matches", "chosen", "values"]:
+        """Content of the rows: all matches; or values, if a part chooses, orders or groups its matches."""
+        plain = self._limit is None and all(part.lists == "matches" for part in self._parts)
+        return "matches" if plain else "values"
+
+    def listed(self) -> Iterator[Interval]:
+        """Yield the matches of all parts, ordered by trace and start, unless :attr:`lists` is ``values``."""
+        yield from self.intervals(bound=True) if self.lists == "matches" else ()
 
     def clips(self, before: float = 0.0, after: float = 0.0) -> Iterator[Clip]:
         """Yield clips around the matching frames of all parts, in log time. Overlapping clips are merged."""

@@ -630,6 +630,11 @@ class Result:
         return any(isinstance(e, Aggregate) for value in values for e in walk(value))
 
     @property
+    def groups(self) -> bool:
+        """True if a row stands for several frames: an aggregate, or ``DISTINCT`` values without the frame."""
+        return self.aggregated or (self.distinct and not (self.whole or self.framed))
+
+    @property
     def chooses(self) -> bool:
         """True if the result leaves out matches: by ``SKIP``, ``LIMIT``, or a ``HAVING`` without groups."""
         chosen = self.limit is not None or self.top is not None or self.skip > 0

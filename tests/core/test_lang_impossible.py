@@ -160,6 +160,29 @@ def test_the_nearest_frame_has_the_settings_of_the_query(open_town: Store) -> No
     assert quoted.nearest() == open_town.find(fast).nearest()
 
 
+def test_a_part_that_occurs_alone_is_told_with_the_others(open_town: Store) -> None:
+    text = (
+        "MATCH (:Person)-[:near]->(:Ego) WHERE EXISTS {(:Truck)-[:near_coll]->(:Ego)} RETURN FRAMES"
+    )
+    near = open_town.find(text).nearest()
+    assert near["failed"] == "EXISTS {(truck:Truck), (any2:Ego), (truck)-[:near_coll]->(any2)}"
+    assert near["others"] == ["(person:Person)-[:near]->(any:Ego)"]
+    frame = f"frame.seq = {near['seq']} AND trace.name = '{near['trace']}'"
+    assert open_town.find(f"MATCH (:Person)-[:near]->(:Ego) WHERE {frame}").count() == 1
+    assert open_town.find("MATCH (:Truck)-[:near_coll]->(:Ego)").count() > 0
+
+
+def test_the_part_is_told_as_it_is_written(open_town: Store) -> None:
+    """The nearest frame is that of the first false part of the definition."""
+    define = "DEFINE meets(a, c) AS a.speed > 3 AND dist(a, c) < 0.5;"
+    near = open_town.find(f"{define} MATCH (e:Ego), (v:Vehicle) WHERE meets(e, v)").nearest()
+    plain = "MATCH (e:Ego), (v:Vehicle) WHERE e.speed > 3 AND dist(e, v) < 0.5"
+
+    assert near.pop("failed") == "meets(e, v)"
+    other = open_town.find(plain).nearest()
+    assert (near["seq"], near["found"]) == (other["seq"], other["found"])
+
+
 def test_parts_without_a_value_have_no_nearest_frame(open_town: Store) -> None:
     train = open_town.find("MATCH (e:Ego)-[:near]->(v:Train)").nearest()
     assert train == {"failed": "(v:Train)"}

@@ -203,7 +203,7 @@ def _key(value: s.Expression, result: b.Result, names: SymbolTable) -> b.Bound |
 def _sampling(sample: s.Sample | None, result: b.Result, names: SymbolTable) -> b.Sampling | None:
     if sample is None:
         return None
-    if result.aggregated or (result.distinct and not (result.whole or result.framed)):
+    if result.groups:
         reason = "SAMPLE chooses among matches, but this query does not list them"
         names.session.refuse(reason, sample.span, "write LIMIT n for the first rows")
     return b.Sampling(sample.number, sample.per and _key(sample.per, result, names))

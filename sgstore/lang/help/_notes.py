@@ -192,7 +192,13 @@ def _first_absent(
         writer, held = Writer(whole, calls), list[str]()
         for part, scope in growing(whole, calls):
             if not exists(scope):
-                yield part, scope, writer, held
+                # A node is also in the edges.
+                yield (
+                    part,
+                    scope,
+                    writer,
+                    [one for one in held if not any(one in o for o in held if o != one)],
+                )
                 return
             edge = isinstance(part, b.Edge)
             held.append(
@@ -201,7 +207,9 @@ def _first_absent(
         return
 
 
-def nearest_query(query: b.Query, exists: Callable[[b.Scope], bool]) -> tuple[str, str, str] | None:
+def nearest_query(
+    query: b.Query, exists: Callable[[b.Scope], bool]
+) -> tuple[str, list[str], str, str] | None:
     """Return a query for the frame that comes closest to the first pattern part that no frame has.
 
     Parameters
@@ -213,28 +221,45 @@ def nearest_query(query: b.Query, exists: Callable[[b.Scope], bool]) -> tuple[st
     Returns
     -------
     failed : str
-        The part that no frame has.
+        The part that no frame has, as written in the query.
+    others : list of str
+        The parts before it, if frames have it without them; otherwise empty.
     value : str
         The value of the part that is compared; empty if the part compares no values.
     text : str
-        The query; empty without such a value. Its columns are trace, frame and value.
+        The query for a frame that has the parts before; empty if the part is a node. Its columns are trace,
+        frame and value.
     """
-    for part, scope, writer, _ in _first_absent(query, exists, {}):
-        failed, others = part_text(part, scope, writer), scope
-        match part:
-            case b.Operation(word="<" | "<=" | ">" | ">=" | "=", operands=(left, right)):
-                if isinstance(left, b.Value):
-                    left, right = right, left
-                value, limit = (writer.expression(one, inner=True) for one in (left, right))
-                others = replace(scope, where=scope.where[:-1])
-            case b.Edge(src=src, dst=dst, high=1) if src != dst:
-                value = f"dist({writer.name(src)}, {writer.name(dst)})"
-                limit, others = "0", replace(scope, edges=scope.edges[:-1])
-            case _:
-                return failed, "", ""
-        shown = f"RETURN trace.name, frame.seq, {value} AS found ORDER BY ABS({value} - {limit})"
-        return failed, value, f"MATCH {writer.block(others)} {shown} LIMIT 1"
+    for part, scope, writer, held in _first_absent(query, exists, query.calls):
+        failed = part_text(part, scope, writer)
+        others = held if held and exists(_alone(part, scope)) else []
+        if part in query.calls and isinstance(part, b.Operation) and part.word == "AND":
+            for inner, wider, other, _ in _first_absent(query, exists, {}):  # its first false part
+                return failed, others, *_nearest(inner, wider, other)
+        return failed, others, *_nearest(part, scope, writer.expanded())
     return None
+
+
+def _nearest(part: b.Node | b.Edge | b.Bound, scope: b.Scope, writer: Writer) -> tuple[str, str]:
+    """Return the value that the last part of a pattern compares, and the query for the nearest frame."""
+    value, limit, others = "", "", replace(scope, where=scope.where[:-1])
+    match part:
+        case b.Node():
+            return "", ""
+        case b.Operation(word="<" | "<=" | ">" | ">=" | "=", operands=(left, right)):
+            if isinstance(left, b.Value):
+                left, right = right, left
+            value, limit = (writer.expression(one, inner=True) for one in (left, right))
+        case b.Edge(src=src, dst=dst, high=1) if src != dst:
+            value = f"dist({writer.name(src)}, {writer.name(dst)})"
+            limit, others = "0", replace(scope, edges=scope.edges[:-1])
+        case b.Edge():
+            others = replace(scope, edges=scope.edges[:-1])
+        case _:
+            pass
+    shown = f"RETURN trace.name, frame.seq, {value or 'NULL'} AS found"
+    order = f" ORDER BY ABS({value} - {limit})" if value else ""
+    return value, f"MATCH {writer.block(others)} {shown}{order} LIMIT 1"
 
 
 def _is_scene(condition: b.Bound) -> bool:

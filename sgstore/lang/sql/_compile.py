@@ -16,6 +16,7 @@ from sgstore.lang.catalog import FRAME_ATTRIBUTES, Catalog, Type
 from sgstore.lang.ir import Bound, FrameAttribute, Query, Result, ReturnColumn
 from sgstore.lang.sql._explain import query_text, statements_text
 from sgstore.lang.sql._known_matches import SPAN, external_matches, nothing, with_places
+from sgstore.lang.sql._listed_matches import listed_matches
 from sgstore.lang.sql._node_owners import with_owners
 from sgstore.lang.sql._rewrite import rewritten
 from sgstore.lang.sql._stages import staged_matches
@@ -207,6 +208,16 @@ class Compiled:
         columns = (*result.columns, ReturnColumn(f":{results.LOG_TIME}", time))
         result = replace(result, framed=True, columns=columns)
         return replace(self, query=replace(self.query, result=result))
+
+    @property
+    def listed(self) -> Compiled | None:
+        """Return a copy with the same rows and the nodes of each; see :func:`listed_matches`."""
+        query, layout = self.query, self.layout
+        if layout is not None:  # without the values of the nodes
+            own = query.result.columns[: len(self.bound.result.columns)]
+            query = replace(query, result=replace(query.result, columns=own, framed=False))
+        query = listed_matches(query)
+        return query and replace(self, bound=query, query=query)
 
     def stages(self) -> str:
         """Return the query as text after each stage of the compiler, from the syntax tree to SQL."""

@@ -269,9 +269,7 @@ class _RowStatement:
         if self.result.whole:
             self.nodes = frozenset(k for k, n in scope.nodes.items() if n.role == "named")
             self.edges = frozenset(edge.key for edge in scope.edges if edge.named)
-        # A row stands for several frames.
-        listed = self.result.framed or self.result.whole
-        self.grouped = (self.result.distinct or self.result.aggregated) and not listed
+        self.grouped = self.result.groups
         # Sampling keys, and keys of ``LIMIT … PER``.
         self.owners, self.top_owners = (
             [] if per is None else owners_of([per], query, writer.catalog)
