@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from sgstore.lang.ir import Query
 
     Match = tuple[str, Mapping[str, int]]
+
+
+_TOLD: Final = ("text", "step", "nodes", "conditions", "meanings", "call")
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +82,7 @@ class TruthLanes:
         Keys: ``trace``, ``binding``, ``lanes``, and ``together`` (ranges by step).
         """
         lanes = [
-            {name: getattr(lane.part, name) for name in ("text", "step", "nodes", "conditions")}
+            {name: getattr(lane.part, name) for name in _TOLD}
             | {"edges": [*map(asdict, lane.part.edges)]}
             | {"spans": lane.spans, "unknown": lane.unknown}
             for lane in self.lanes

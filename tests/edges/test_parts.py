@@ -84,6 +84,31 @@ def test_without_a_binding_it_is_that_of_the_frame(store: Store) -> None:
     assert [lane.part.text for lane in lanes.lanes] == ["(e)-[:near_coll]->(v)", "v.speed > 1"]
 
 
+def test_words_of_the_library_are_shown_as_written(store: Store) -> None:
+    """The parts of a call are lanes of their own; each has the call, and its condition in full."""
+    define = "DEFINE passes(a, c) AS a.speed > 3 AND c.speed < 2 AND dist(a, c) < 40;"
+    query = (
+        f"{define} MATCH (e:Ego), (v:Vehicle) WHERE passes(e, v) AND NOT stopped(e) AND lead(e, v)"
+    )
+    parts = [one.part for one in store.parts(query, "town#50").lanes]
+
+    assert [(one.call, one.text) for one in parts] == [
+        *(("passes(e, v)", text) for text in ("e.speed > 3", "v.speed < 2", "dist(e, v) < 40")),
+        *(("", text) for text in ("NOT stopped(e)", "lead(e, v)")),
+    ]
+    assert [one.conditions for one in parts] == [(one.text,) for one in parts]
+    assert [one.meanings == one.conditions for one in parts] == [True, True, True, False, False]
+    assert "leads" in parts[-1].meanings[0]
+    sequence = f"{define} MATCH (e:Ego), (v:Vehicle) WHERE EVENTUALLY WITHIN 3s lead(e, v)"
+    (over_time,) = (one.part for one in store.parts(sequence, "town#50").lanes)
+    assert over_time.text == "EVENTUALLY WITHIN 3s lead(e, v)"
+    # Conditions that share a variable without a node are one part, with the call as a whole.
+    (whole,) = (one.part for one in store.parts(query, "town#50", {}).lanes)
+    assert whole.call == ""
+    assert whole.conditions[0] == "passes(e, v)"
+    assert whole.meanings[0].count("AND") == 2
+
+
 def test_where_nothing_matches_it_is_what_comes_nearest(store: Store) -> None:
     query = "MATCH (e:Ego), (v:Vehicle) WHERE e.speed > 500 AND v.speed > 0"
     lanes = store.parts(query, "town#3")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 from sgstore.errors import QueryNameError
 from sgstore.lang import ir as b
 from sgstore.lang.catalog import NODE_ATTRIBUTES, Type
-from sgstore.lang.help._pattern_text import Writer, in_words, label_written
+from sgstore.lang.help._pattern_text import Writer, in_words, joined_calls, label_written
 from sgstore.lang.sql import value_text
 from sgstore.model.vocabulary import RELATIONS
 
@@ -39,7 +39,7 @@ class PatternPart:
     Attributes
     ----------
     text : str
-        Text in the query language.
+        Text in the query language, with calls of predicates as written.
     step : int
         Number of the step in a sequence, from 1; 0 for a single-frame pattern.
     query : Query
@@ -48,6 +48,11 @@ class PatternPart:
         Labels of the nodes of the part, by key.
     edges : tuple of DrawnEdge
     conditions : tuple of str
+        Conditions as written.
+    meanings : tuple of str
+        The same conditions without calls of predicates.
+    call : str
+        Call of the predicate whose definition this part is from; empty if the part is written in the query.
     """
 
     text: str
@@ -56,6 +61,8 @@ class PatternPart:
     nodes: Mapping[str, str]
     edges: tuple[DrawnEdge, ...]
     conditions: tuple[str, ...]
+    meanings: tuple[str, ...]
+    call: str = ""
 
 
 _Atom = b.Edge | b.Node | b.Bound
@@ -119,7 +126,7 @@ def _parts(
     number: int,
     step: b.BoundStep | None,
 ) -> Iterator[PatternPart]:
-    writer = Writer(scope)
+    writer = Writer(scope, query.calls)
     for atoms in _groups(scope, when, pins):
         keys = _spoken_of(atoms, scope)
         part = _narrowed(scope, atoms, keys, pins, when)
@@ -151,7 +158,12 @@ def _told(
     query: b.Query,
 ) -> PatternPart:
     edges = [atom for atom in atoms if isinstance(atom, b.Edge)]
-    tests = [_written(atom, writer) for atom in atoms if not isinstance(atom, b.Edge | b.Node)]
+    conditions = [atom for atom in atoms if not isinstance(atom, b.Edge | b.Node)]
+    whole = list(joined_calls(conditions, writer.calls))
+    tests = [_written(one, writer) for one in whole]
+    meanings = tuple(_written(one, writer.expanded()) for one in whole)
+    alone = len(conditions) == len(atoms)
+    call = _call_of(whole, scope, writer.calls) if alone else ""
     paths = [writer.node(atom.key, atom.kinds) for atom in atoms if isinstance(atom, b.Node)]
     paths += [writer.edge(edge, scope) for edge in edges]
     text = ", ".join(paths)
@@ -161,15 +173,28 @@ def _told(
         DrawnEdge(writer.name(edge.src), writer.name(edge.dst), _label(edge), edge.both)
         for edge in edges
     )
-    return PatternPart(text, number, query, labels, drawn, tuple(tests))
+    return PatternPart(text, number, query, labels, drawn, tuple(tests), meanings, call)
 
 
 def _written(condition: b.Bound, writer: Writer) -> str:
-    return (
-        value_text(in_words(condition))
-        if b.is_temporal(condition)
-        else writer.expression(condition)
-    )
+    if not b.is_temporal(condition):
+        return writer.expression(condition)
+
+    def called(value: b.Bound) -> b.Bound:
+        text = writer.calls.get(value)
+        return b.with_operands(value, called) if text is None else b.GroupKey(text, value.type)
+
+    return value_text(in_words(called(condition)))
+
+
+def _call_of(conditions: Sequence[b.Bound], scope: b.Scope, calls: b.Calls) -> str:
+    """Return the call whose definition has all these conditions and others; empty without such a call."""
+    for call, text in calls.items():
+        parts = b.conjuncts(call)
+        inside = len(parts) > len(conditions) and all(one in parts for one in conditions)
+        if inside and call in joined_calls(scope.where, calls):
+            return text
+    return ""
 
 
 def _label(edge: b.Edge) -> str:

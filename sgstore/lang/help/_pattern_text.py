@@ -229,6 +229,17 @@ class Writer:
         return f"({text})" if inner else text
 
 
+def joined_calls(where: Sequence[b.Bound], calls: b.Calls) -> Iterator[b.Bound]:
+    """Yield the conditions of a pattern. Those of one predicate are joined again."""
+    joined = {parts: call for call in calls if len(parts := tuple(b.conjuncts(call))) > 1}
+    at = 0
+    while at < len(where):
+        fits = (parts for parts in joined if tuple(where[at : at + len(parts)]) == parts)
+        parts = next(fits, None)
+        yield where[at] if parts is None else joined[parts]
+        at += 1 if parts is None else len(parts)
+
+
 def pattern_text(scope: b.Scope) -> str:
     """Return the query text of a pattern, as after ``MATCH``."""
     return Writer(scope).block(scope)

@@ -14,7 +14,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.lang import ir as b
-from sgstore.lang.help._pattern_text import Writer, kind_label, text_written
+from sgstore.lang.help._pattern_text import Writer, joined_calls, kind_label, text_written
 from sgstore.lang.memory import Binding, FrameView, NodePair, ScopeSearch, expression
 from sgstore.lang.operators import MIRRORED
 from sgstore.lang.sql import TRACE_OF_FRAME, happened_in_frame, leaves, told_events
@@ -260,18 +260,7 @@ def _parts(scope: b.Scope, calls: b.Calls) -> list[_Part]:
         complete = [edge for edge in edges if {edge.src, edge.dst} <= seen]
         edges = [edge for edge in edges if edge not in complete]
         parts += complete
-    return [*parts, *edges, *_together(scope.where, calls)]
-
-
-def _together(where: Sequence[b.Bound], calls: b.Calls) -> Iterator[b.Bound]:
-    """Yield the conditions of a pattern, with the conditions of one predicate call joined by ``AND``."""
-    joined = {parts: call for call in calls if len(parts := tuple(b.conjuncts(call))) > 1}
-    at = 0
-    while at < len(where):
-        fits = (parts for parts in joined if tuple(where[at : at + len(parts)]) == parts)
-        parts = next(fits, None)
-        yield where[at] if parts is None else joined[parts]
-        at += 1 if parts is None else len(parts)
+    return [*parts, *edges, *joined_calls(scope.where, calls)]
 
 
 def growing(whole: b.Scope, calls: b.Calls) -> Iterator[tuple[b.Node | b.Edge | b.Bound, b.Scope]]:
