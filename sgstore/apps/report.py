@@ -72,7 +72,8 @@ def report(
     parameters : mapping, optional
         Values of ``$name``.
     most : int
-        Greatest number of matches: as many of each trace, over its whole time.
+        Greatest number of matches: as many of each trace, over its whole time. If the query orders its
+        matches: the first ones.
     around_s : float
         Additional time before and after each match; s.
     pictures : bool
@@ -168,7 +169,7 @@ def _kept(
     """Return the data of a report page as JSON values, the matches, and True if the query has more matches."""
     is_check = re.match(r"\s*(?:--[^\n]*\n\s*)*(?:DEFINE\b[^;]*;\s*)*CHECK\b", text, re.IGNORECASE)
     question = {"text": text, "parameters": values}
-    asked = {"ask": "check" if is_check else "matches", **question}
+    asked = {"ask": "check" if is_check else "matches", "absent": True, **question}
     told = _spread(list(answer(store, asked, max(most, MOST_LOOKED_AT))), most)
     check, found = None, list[Found]()
     if is_check:
@@ -200,13 +201,17 @@ def _kept(
 
 
 def _spread(told: list[dict[str, Any]], most: int) -> list[dict[str, Any]]:
-    """Return replies with at most ``most`` matches or violations in total, spread over the traces."""
+    """Return replies with at most ``most`` matches or violations.
+
+    They are spread over the traces, or the first ones in the order of the query.
+    """
     lists = [(reply, "matches", "") for reply in told if "matches" in reply]
     lists += [(one, "spans", one["trace"]) for one in told[-1].get("verdicts", ())]
     traces = [str(trace or row[0]) for part, key, trace in lists for row in part[key]]
     if len(traces) <= most:
         return told
-    kept = chosen_spread(traces, most)
+    chosen = told[0].get("lists") == "chosen"
+    kept = set(range(most)) if chosen else chosen_spread(traces, most)
     number = 0
     for part, key, _ in lists:
         end = number + len(part[key])

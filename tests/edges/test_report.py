@@ -148,6 +148,19 @@ def test_no_more_matches_than_wanted(store: Store, tmp_path: Path) -> None:
     assert verdict["violations"] == len(spans) > 2
 
 
+def test_matches_of_a_report_keep_the_order_of_the_query(store: Store, tmp_path: Path) -> None:
+    text = f"{NEAR} ORDER BY gap(e, v)"
+    report(store, text, tmp_path / "r.html", parameters={"least": 1}, most=3)
+    told = kept_in(tmp_path / "r.html")["find"]
+    rows = [row for reply in told for row in reply.get("matches", ())]
+
+    assert [row[1] for row in rows] == [one.seq for one in store.find(text, least=1).head(3)]
+    least = f"{NEAR} RETURN MIN(gap(e, v)) AS least"
+    assert report(store, least, tmp_path / "l.html", parameters={"least": 1}) == (0, False)
+    (told,) = kept_in(tmp_path / "l.html")["find"]
+    assert told["rows"] == [list(row) for row in store.find(least, least=1)]
+
+
 @pytest.mark.parametrize("most", [1, 4, 7, 9, 30])
 def test_matches_of_a_report_are_spread_over_traces(most: int) -> None:
     """As many as wanted; no trace has more than one above another that has more to give."""

@@ -283,6 +283,23 @@ def test_matches_come_as_lines(page: Page, store: Store) -> None:
     assert lines[-1]["count"] == len(spans)
 
 
+def test_matches_keep_the_order_of_the_query(page: Page, store: Store) -> None:
+    text = f"{NEAR} ORDER BY gap(e, v) LIMIT 5"
+    head, *lines = page.find(text)
+    rows = [row for line in lines for row in line.get("matches", [])]
+    (names,) = (line["names"] for line in lines if "names" in line)
+
+    assert head["lists"] == "chosen"
+    assert [(row[0], row[1], row[5 + names.index("v")]) for row in rows] == [
+        (row.trace, row.seq, row.v) for row in store.find(text)
+    ]
+    (told,) = page.find(f"{NEAR} RETURN v.kind AS kind, MIN(gap(e, v)) AS least ORDER BY least")
+    assert (told["lists"], told["columns"]) == ("values", ["kind", "least"])
+    assert [row[1] for row in told["rows"]] == sorted(row[1] for row in told["rows"])
+    (told,) = page.find(f"{NEAR} RETURN gap(e, v) AS gap", ask="rows")
+    assert len(told["rows"]) == len(store.find(NEAR))
+
+
 def test_answers_carry_the_stamp_of_their_store(page: Page, store: Store) -> None:
     stamp = page.get("/api/stamp").json()
 
@@ -524,6 +541,15 @@ def test_words_and_library(page: Page) -> None:
     }
     near = page.post("/api/nearest", text="MATCH (e:Ego) WHERE e.speed > 60").json()
     assert near["failed"] == "e.speed > 60"
+
+
+def test_names_of_the_library_differ_with_their_source(page: Page) -> None:
+    library = page.get("/api/library").json()
+    shown = [(one["name"].lower().replace("_", ""), one["library"]) for one in library]
+
+    assert {source for name, source in shown if name == "cutin"} == {"concepts", "leaderboard"}
+    assert len({*shown}) == len(shown)
+    assert all(one["source"] for one in library)
 
 
 def test_tags_are_kept_beside_the_store_and_can_be_asked_for(page: Page, town_store: Path) -> None:

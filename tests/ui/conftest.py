@@ -72,15 +72,28 @@ def served(written: Path) -> Iterator[Callable[[Path], str]]:
         child.communicate(timeout=120)
 
 
+SIZE = {"width": 1440, "height": 900}
+
+
+@pytest.fixture(scope="session")
+def context(browser: Any) -> Iterator[Any]:
+    """Profile of all pages of a run. It keeps the files of the page, so that each page loads faster."""
+    context = browser.new_context(viewport=SIZE)
+    yield context
+    context.close()
+
+
 @pytest.fixture
-def visit(browser: Any) -> Iterator[Callable[..., Any]]:
+def visit(browser: Any, context: Any) -> Iterator[Callable[..., Any]]:
     """Opens pages; at the end nothing was wrong on the console, and no other host was asked."""
-    contexts, wrong, asked = list[Any](), list[str](), list[tuple[str, str]]()
+    contexts, pages = list[Any](), list[Any]()
+    wrong, asked = list[str](), list[tuple[str, str]]()
 
     def opened(address: str, **how: Any) -> Any:
-        context = browser.new_context(viewport={"width": 1440, "height": 900}, **how)
-        contexts.append(context)
-        page = context.new_page()
+        if how:
+            contexts.append(browser.new_context(viewport=SIZE, **how))
+        page = (contexts[-1] if how else context).new_page()
+        pages.append(page)
         page.set_default_timeout(60_000)
 
         def on_console(told: Any) -> None:
@@ -100,9 +113,9 @@ def visit(browser: Any) -> Iterator[Callable[..., Any]]:
         return page
 
     yield opened
-    urls = [page.url for context in contexts for page in context.pages]
-    for context in contexts:
-        context.close()
+    urls = [page.url for page in pages]
+    for one in [*pages, *contexts]:
+        one.close()
     assert wrong == []
     for address, url in asked:
         host = re.match(r"http://[^/]+/|file:", address)

@@ -92,7 +92,7 @@ def test_matches_are_those_of_the_store(page: Any, town_store: Path) -> None:
 def test_a_parameter_is_a_field(page: Any, town_store: Path) -> None:
     query = f"{NEAR} WHERE e.speed > $least"
     search(page, query)
-    expect(page.locator(".status .error")).to_contain_text("write one into its field above")
+    expect(page.locator(".sheet")).to_contain_text("write one into its field above")
     page.get_by_label("Value of $least").fill("3")
     page.get_by_label("Value of $least").press("Enter")
     many = len(list(Store(town_store).find(query, least=3).intervals()))
@@ -171,7 +171,7 @@ def test_from_a_mistake_to_a_test_set(
 
 def mend_a_mistake(page: Any, query: str) -> None:
     search(page, "MATCH (e:Ego)-[:near_kol]->(v)")
-    expect(page.locator(".status .error")).to_contain_text("near_coll")
+    expect(page.get_by_role("button", name="near_coll", exact=True).first).to_be_visible()
     expect(page.locator(".cm-lintRange-error")).to_have_text("near_kol")
     search(page, query)
     expect(page.locator(".status .error")).to_have_count(0)
@@ -266,6 +266,16 @@ def test_what_two_queries_differ_in_is_a_gallery(page: Any, town_store: Path) ->
     a, b = ({frame.seq for frame in store.find(query).frames()} for query in (NEAR, other))
     told = f"{len(a)} frames in A, {len(b)} in B; only in A {len(a - b)}, only in B {len(b - a)}"
     expect(page.locator(".compare .status")).to_contain_text(told)
+    whole = next(
+        span
+        for span in store.find(other).intervals(bound=True)
+        if {*range(span.start_seq, span.end_seq + 1)} <= b - a
+        and {span.start_seq - 1, span.end_seq + 1}.isdisjoint(b - a)
+    )
+    times = (
+        f"{whole.start:.1f}\u2013{whole.end:.1f} s" if whole.frames > 1 else f"{whole.end:.1f} s"
+    )
+    expect(page.locator(f".tile[data-index$=' {whole.start_seq}']").last).to_contain_text(times)
     tile = page.locator(".tile[data-index^='B ']").first
     tile.locator("canvas[data-painted]").wait_for()
     seen(page, "compare")
@@ -322,7 +332,7 @@ def test_a_monitor_is_seen_while_it_runs(visit: Callable[..., Any]) -> None:
         seen(page, "live")
         if AXE.exists():
             assert faults(page) == []
-        page.context.close()  # before what it listens to is gone
+        page.close()  # before what it listens to is gone
     finally:
         child.terminate()
         child.communicate(timeout=120)

@@ -222,6 +222,7 @@ def test_many_matches_are_ticked_at_once_and_survive_a_reload(page: Any, served:
     expect(page.get_by_role("heading", name=f"{MANY - 1:,} clips")).to_be_visible()
     expect(page.locator(f".clip[aria-posinset='{MANY - 1}'] :focus")).to_have_text("remove")
     page.wait_for_function("was => location.hash !== was", arg=was)
+    assert "of=a" in page.evaluate("location.hash")  # the store of B
     page.reload()
     expect(page.get_by_role("heading", name=f"{MANY - 1:,} clips")).to_be_visible()
     expect(page.locator(".clip").first).to_contain_text("0.00 s")

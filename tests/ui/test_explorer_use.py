@@ -202,7 +202,50 @@ def test_scene_has_a_legend_and_matches_have_tags_by_mouse(page: Any, town_store
     page.get_by_role("button", name="legend").click()
     expect(page.locator(".legend")).to_contain_text("lane: driving")
     page.locator(".above canvas").hover()  # the ego is in the middle
-    expect(page.locator(".tip")).to_contain_text("m/s")
+    expect(page.locator(".tip")).to_have_text(re.compile(r"^\s*e \u00b7 car 0 \u00b7 [\d.]+ m/s"))
+
+
+PAINTS: Final = """async node => {
+  const {store} = await import(new URL("static/js/state.js", document.baseURI));
+  if (node) store.value = {...store.value, traces: store.value.traces.map(one => ({...one, map_key: ""}))};
+  const told = [], of = CanvasRenderingContext2D.prototype, was = {};
+  for (const name of ["fillText", "arc", "fill", "stroke", "roundRect"]) {
+    was[name] = of[name];
+    of[name] = function (...given) {
+      const dashes = this.getLineDash().length > 0;
+      const colour = name === "stroke" ? this.strokeStyle : this.fillStyle;
+      told.push([name, String(given[0]), colour, this.lineWidth, dashes]);
+      return was[name].apply(this, given);
+    };
+  }
+  document.querySelector(".above [aria-pressed]").click();
+  await new Promise(done => setTimeout(done, 300));
+  Object.assign(of, was);
+  return told;
+}"""
+"""Paint the view from above once more, and return the calls of its canvas; with a store without maps."""
+
+
+def test_scene_shows_lights_crosswalks_directions_rings_and_a_grid(page: Any) -> None:
+    page.emulate_media(color_scheme="light")
+    search(page, "MATCH (e:Ego)-[:near]->(t:TrafficLight)")
+    open_first(page)
+    page.locator(".camera canvas[data-frame]").wait_for()  # the states and the map have come
+    page.get_by_role("button", name="legend").click()
+    expect(page.locator(".legend")).to_contain_text("crosswalk")
+    calls = page.evaluate(PAINTS, arg=False)
+    texts = {call[1] for call in calls if call[0] == "fillText"}
+    filled = {call[2] for call in calls if call[0] == "fill"}
+    stroked = [call[2:] for call in calls if call[0] == "stroke"]
+    assert {"10 m", "20 m"} <= texts  # rings around the ego
+    assert any(dashed for _, _, dashed in stroked)
+    assert "#20262e" in filled  # the housing of a light
+    assert filled & {"#e5383b", "#ffb703", "#2ec4a0"}  # its lamp
+    assert "#fdfdfb" in filled  # stripes of crosswalks
+    assert ["#f7f9fb", 0.18, False] in stroked  # arrows of the driving direction
+    assert "#dfe4dd" not in {colour for colour, *_ in stroked}
+    calls = page.evaluate(PAINTS, arg=True)
+    assert "#dfe4dd" in {call[2] for call in calls if call[0] == "stroke"}  # the grid without a map
 
 
 def test_coverage_is_told_in_words_pictures_and_gaps(page: Any) -> None:
@@ -218,6 +261,7 @@ def test_coverage_is_told_in_words_pictures_and_gaps(page: Any) -> None:
 
     page.route("**/api/coverage", hold)
     page.get_by_role("button", name="Growth").click()
+    expect(page.get_by_role("status")).to_have_text(re.compile(r"working … \d+ s"))
     page.get_by_role("button", name="Stop").click()
     page.unroute("**/api/coverage")
     expect(page.get_by_text("stopped")).to_be_visible()

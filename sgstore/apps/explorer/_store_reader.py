@@ -179,7 +179,7 @@ class Reads:
 
     def library(self) -> list[dict[str, Any]]:
         """Return the patterns of the library, each with a drawing."""
-        names = ("name", "kind", "text", "sentence", "library")
+        names = ("name", "kind", "text", "sentence", "library", "source")
         return [
             {name: getattr(one, name) for name in names} | {"drawing": one.example}
             for one in patterns().values()

@@ -28,14 +28,23 @@ BATCH_ROWS: Final = 500
 
 
 def _told_matches(store: Store, question: dict[str, Any], most: int) -> Iterator[Reply]:
-    """Yield the replies to a pattern query: columns, traces without an answer, then groups of matches."""
+    """Yield the replies to a pattern query: columns and traces that cannot answer, then batches of matches.
+
+    If rows are values of several matches, there is one reply with the rows instead.
+    """
     with store.file.snapshot():
         matches = store.find(question["text"], **question["parameters"])
+        if matches.lists == "values":
+            for told in _told_rows(store, question, most):
+                yield told | {"lists": "values"}
+            return
         names, found = tuple[str, ...](), list[list[Any]]()
         many, sent = 0, time.monotonic()
-        head = {"reasons": matches.reasons, "columns": matches.columns}
+        head = {"reasons": matches.reasons, "columns": matches.columns, "lists": matches.lists}
         yield {"more": True, "stamp": store.file.stamp, **head}
-        for interval in islice(matches.intervals(bound=True), most + 1):
+        chosen = matches.lists == "chosen"
+        intervals = matches.listed() if chosen else matches.intervals(bound=True)
+        for interval in islice(intervals, most + 1):
             many += 1
             if many > most:
                 break
@@ -50,7 +59,9 @@ def _told_matches(store: Store, question: dict[str, Any], most: int) -> Iterator
                 yield {"more": True, "matches": found}
                 found, sent = [], time.monotonic()
         yield {"more": True, "matches": found}
-        yield {"count": min(many, most), "truncated": many > most, "notes": matches.notes}
+        # The page asks for the nearest frame instead of a note on the part that no frame has.
+        notes = matches.notes if question.get("absent") else matches.mistakes
+        yield {"count": min(many, most), "truncated": many > most, "notes": notes}
 
 
 def _told_rows(store: Store, question: dict[str, Any], most: int) -> Iterator[Reply]:

@@ -2,6 +2,7 @@ import assert from "node:assert/strict";
 import test from "node:test";
 import { match } from "./page.mjs";
 
+const { ordered, ORDERS } = await import("../../../sgstore/apps/explorer/page/js/order.js");
 const { layout, moved } = await import("../../../sgstore/apps/explorer/page/js/gallery.js");
 
 test("tiles stand in rows below the name of their trace", () => {
@@ -23,4 +24,21 @@ test("arrow keys lead through the rows", () => {
   const to = (at, key) => moved(rows, at, key, 2);
   assert.deepEqual([to(1, "ArrowDown"), to(4, "ArrowDown"), to(7, "ArrowUp"), to(0, "ArrowLeft")], [4, 7, 4, 0]);
   assert.deepEqual([to(0, "End"), to(5, "Home"), to(0, "PageDown")], [7, 0, 6]);
+});
+
+test("each order has all matches, and sorts them as its word says", () => {
+  const found = [...Array(40).keys()].map((i) => match(i, i + ((i * 7) % 13), {}, { trace: i < 30 ? "a" : i < 38 ? "b" : "c",
+    start: i, end: i + ((i * 7) % 13) }));
+  const places = (order) => ordered(found, order).map((m) => m.index), lasts = (order) => ordered(found, order)
+    .map((m) => m.end - m.start), upward = (all) => all.every((one, i) => !i || all[i - 1] <= one);
+  for (const order of Object.keys(ORDERS)) {
+    assert.deepEqual(places(order).toSorted((a, b) => a - b), found.map((m) => m.index));
+    assert.deepEqual(places(order), places(order)); // the same each time
+  }
+  assert.deepEqual(places(""), found.map((m) => m.index));
+  assert.ok(upward(lasts("short")) && upward(lasts("long").toReversed()));
+  assert.ok(!upward(places("random")) && !upward(places("random").toReversed()));
+  // Spread: the first ones are of all traces, and from the middle of each.
+  assert.deepEqual(ordered(found, "spread").slice(0, 3).map((m) => m.trace).toSorted(), ["a", "b", "c"]);
+  assert.deepEqual(ordered(found, "spread").slice(0, 2).map((m) => m.index), [15, 34]);
 });

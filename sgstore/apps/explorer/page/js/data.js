@@ -82,11 +82,12 @@ export function forget() {
   wantThumbs(inSight);
 }
 
-/** Why something near a trace cannot be shown; empty: nothing failed. @param {string} trace */
+/** Why something near a trace cannot be shown; empty: nothing failed, or the page says it above. @param {string} trace */
 export function failureOf(trace) {
   const keys = [...chunks.keys()].filter((key) => key.startsWith(`${trace}\n`)).map((key) => chunks.get(key));
   const failed = [still.get(trace), ...keys].find((one) => one?.failed)?.failed;
-  return failed ? String(failed.message || failed) : "";
+  const reason = failed ? String(failed.message || failed) : "";
+  return reason === api.trouble.value ? "" : reason; // it stands above the page
 }
 
 /** What a request calls a trace. @param {import("./state.js").Trace} about */

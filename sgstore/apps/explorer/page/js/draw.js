@@ -2,6 +2,7 @@
 // Scenes on a canvas, from columns: the road map, what stands and what moves, what is matched.
 import { computed } from "../vendor/core.js";
 import { kindOf, lightOf, mapOf, stillOf } from "./data.js";
+import { placed } from "./labels.js";
 import { paints, traces } from "./state.js";
 
 /** @typedef {import("./data.js").States} States */
@@ -328,12 +329,13 @@ export function paintScene(ctx, trace, states, look, ratio, what) {
   paintScale(ctx, look, ink);
 }
 
-/** Names beside what they name, none of them on another, or on what another names.
+/** Names beside what they name, none of them on another, or on what another names. A name without room is left out;
+ * the pointer shows it.
  * @param {CanvasRenderingContext2D} ctx @param {string} trace
  * @param {States} states @param {Look} look @param {Inks} ink @param {Map<number, string>} names */
 function paintNames(ctx, trace, states, look, ink, names) {
   const place = axes(look), c = states.columns;
-  const named = [...names].sort(([a], [b]) => b - a).flatMap(([node, name]) => { // entities before parts of the map
+  const named = [...names].sort(([a], [b]) => Number(b >= 0) - Number(a >= 0)).flatMap(([node, name]) => { // entities before parts of the map
     const at = spotOf(trace, states, node, [look.x, look.y]), row = rowOf(states, node);
     if (!at) return [];
     const angle = (c.heading[row] || 0) + look.turn, cos = Math.abs(Math.cos(angle)), sin = Math.abs(Math.sin(angle));
@@ -343,13 +345,15 @@ function paintNames(ctx, trace, states, look, ink, names) {
   });
   const taken = named.map(({ at, aside, along }) => ({ x: at.x - aside, y: at.y - along, wide: 2 * aside,
     high: 2 * along }));
-  for (const { name, at, aside } of named) {
+  const boxes = placed(named.map(({ name, at, aside }) => {
     const wide = ctx.measureText(name).width + 10, right = at.x + aside + 8, left = at.x - aside - 8 - wide;
-    const spots = [-24, 6, -46, 28].flatMap((down) => [{ x: right, y: at.y + down }, { x: left, y: at.y + down }]);
-    const free = spots.find(({ x, y }) => taken.every((o) => y > o.y + o.high + 2 || o.y > y + 20
-      || x > o.x + o.wide + 3 || o.x > x + wide + 3));
-    const { x, y } = free || { x: right, y: at.y - 24 };
-    taken.push({ x, y, wide, high: 18 });
+    return [-24, 6, -46, 28, -68, 50].flatMap((down) => [right, left].map((x) => ({ x, y: at.y + down, wide,
+      high: 18 })));
+  }), taken, 3);
+  named.forEach(({ name }, i) => {
+    const box = boxes[i];
+    if (!box) return;
+    const { x, y, wide } = box;
     ctx.fillStyle = ink.raised;
     ctx.globalAlpha = 0.88;
     ctx.beginPath();
@@ -358,7 +362,7 @@ function paintNames(ctx, trace, states, look, ink, names) {
     ctx.globalAlpha = 1;
     ctx.fillStyle = ink.ink;
     ctx.fillText(name, x + 5, y + 9.5);
-  }
+  });
 }
 
 /** @param {CanvasRenderingContext2D} ctx @param {string} trace @param {States} states @param {Look} look

@@ -3,8 +3,9 @@
 import { h, htm, useEffect, useLayoutEffect, useMemo, useRef, useState } from "../vendor/core.js";
 import { arrived, mapOf, seconds, stillOf, thumbOf, timesOf, wantThumbs } from "./data.js";
 import { fitted, lookAt, paintScene } from "./draw.js";
-import { merged, ORDERS } from "./order.js";
-import { dialog, keyOf, notes, offline, open, openMatch, order, paints, tagged, tick, ticked,
+import { shown } from "./verdicts.js";
+import { BY_QUERY, merged, ORDERS } from "./order.js";
+import { answer, dialog, keyOf, notes, offline, open, openMatch, order, paints, tagged, tick, ticked,
   traces } from "./state.js";
 
 const html = htm.bind(h);
@@ -12,7 +13,9 @@ const GAP = 12, HEAD = 32;
 const REST = 100; // ms without a jump, after which what flew past stands
 
 /** What the matches before and behind are grouped by. @param {import("./state.js").Match | undefined} match */
-const groupOf = (match) => match?.group ?? (order.value ? ORDERS[order.value] : match?.trace) ?? "";
+const groupOf = (match) => match?.group ?? (order.value ? ORDERS[order.value] : isOrdered() ? BY_QUERY : match?.trace) ?? "";
+/** True if the query itself orders or chooses its matches. */
+const isOrdered = () => answer.value.lists === "chosen";
 
 /** Where everything stands: groups and rows, by their heights.
  * @param {import("./state.js").Match[]} found @param {number} width */
@@ -78,7 +81,8 @@ function Tile({ match, at, x, y, wide, high, flies, turn, many }) {
   const isOpen = open.value?.match && keyOf(open.value.match) === keyOf(match), on = ticked.value.has(keyOf(match));
   const tags = notes.value.filter((n) => n[0] === match.trace && n[1] >= match.first && n[1] <= match.last);
   const who = Object.entries(match.names).filter(([name]) => name !== "e"
-    && name !== "ego").map(([, v]) => v).join(", ");
+    && name !== "ego").map(([, v]) => v).concat(Object.entries(match.values).filter(([, v]) => typeof v !== "object")
+    .map(([name, v]) => `${name} ${shown(v)}`)).join(", ");
   return html`<div class=${`tile ${isOpen ? "chosen" : ""}`}
     style=${{ left: `${x}px`, top: `${y}px`, width: `${wide}px`, height: `${high}px` }}
       data-index=${match.index} data-at=${at} onClick=${match.go || (() => openMatch(match))}>
@@ -96,7 +100,7 @@ function Tile({ match, at, x, y, wide, high, flies, turn, many }) {
         title="tag this match" aria-label=${`Tag ${match.trace} ${start} s`}
         onClick=${(/** @type {Event} */ event) => { event.stopPropagation(); tagged.value = { trace: match.trace,
           first: match.first, last: match.last }; dialog.value = "tag"; }}>+ tag</button>`}
-      ${order.value ? html`<span class="faint">${match.trace}</span>` : null}<span class="who" title=${who}>
+      ${order.value || (isOrdered() && !match.group) ? html`<span class="faint">${match.trace}</span>` : null}<span class="who" title=${who}>
         ${who}</span>
     </div></div>`;
 }
@@ -136,7 +140,7 @@ export function Gallery({ found: all, none, word = ["match", "matches"] }) {
     return () => watch.disconnect();
   }, []);
   // Of thousands of matches it is made once, not while it is scrolled.
-  const { rows, height, wide, high } = useMemo(() => layout(found, box.width), [found, box.width, order.value]);
+  const { rows, height, wide, high } = useMemo(() => layout(found, box.width), [found, box.width, order.value, isOrdered()]);
   const low = Math.max(0, rows.findIndex((row) => row.top + row.height >= box.top - 200)),
     end = box.top + box.height + 200;
   // As many rows each time: rows out of sight lend their elements to new ones, which would take most of the time.

@@ -1,18 +1,19 @@
 // @ts-check
 // The library and the words of the language: cards before anything is asked, a search in them, what comes near a mistake.
-import { effect, h, htm, signal, useEffect, useRef, useState } from "../vendor/core.js";
+import { effect, h, htm, signal, useEffect, useState } from "../vendor/core.js";
 import * as api from "./api.js";
-import { answer, ask, idle, isLost, library, matchesIn, open, reasonOf, store, tally, view, words } from "./state.js";
+import { answer, ask, idle, isLost, library, matchesIn, open, reasonOf, sought, store, tally, view,
+  words } from "./state.js";
+import { Elapsed } from "./status.js";
 
 const html = htm.bind(h);
 const MOST_CARDS = 24, MOST_WORDS = 12;
 const PAUSE = 400; // ms between looks whether the library may be counted
 
-/** @typedef {{name: string, kind: string, text: string, sentence: string, library: string, drawing: string}} Entry */
+/** @typedef {{name: string, kind: string, text: string, sentence: string, library: string, source: string,
+ *   drawing: string}} Entry */
 /** @typedef {{name: string, meaning: string, text: string}} Word */
 
-/** Words that are sought in the library and the vocabulary. */
-export const sought = signal("");
 let last = "";
 effect(() => { // a question ends the search
   const { id } = answer.value;
@@ -95,20 +96,22 @@ function nearWords(text) {
     || a.word.name.length - b.word.name.length).slice(0, MOST_WORDS).map(({ word }) => word);
 }
 
-/** The words that were sought last, and entries of the library near them, the nearest first; null: not known yet.
- * @param {string} text */
+/** Entries of the library near some words, the nearest first. An answer to other words is not shown.
+ * @param {string} text @returns {{cards?: Entry[], error?: string}} without cards: not known yet */
 function useNear(text) {
-  const [found, tell] = useState(/** @type {{of: string, names: string[]} | null} */ (null));
+  const [found, tell] = useState(/** @type {{of: string, names: string[], error?: string}} */ ({ of: "", names: [] }));
   useEffect(() => {
     const mine = new AbortController();
     if (text) {
       api.json(api.address("api/search", { text: text.slice(0, 300) }), undefined, { signal: mine.signal })
-        .then((names) => tell({ of: text, names }), () => {});
+        .then((names) => tell({ of: text, names }), (error) => {
+          if (!mine.signal.aborted) tell({ of: text, names: [], error: reasonOf(error) });
+        });
     }
     return () => mine.abort();
   }, [text]);
-  if (!text || !found) return null;
-  return { of: found.of, cards: found.names.flatMap((name) => library.value.filter((one) => one.name === name
+  if (found.of !== text) return {};
+  return { error: found.error, cards: found.names.flatMap((name) => library.value.filter((one) => one.name === name
     && one.kind !== "predicate")) };
 }
 
@@ -120,20 +123,26 @@ function Card({ one }) {
       ${told.count < 0 ? "–" : told.count}${told.more}</span>`
     : html`<span class="faint">…</span>`;
   return html`<button class="card" key=${one.name} onClick=${() => ask(one.text)}>
-    <h3>${one.name.replace(/_/g, " ")} <span class="grow"></span>${many}</h3>
+    <h3>${one.name.replace(/_/g, " ")} <small title=${one.source}>${one.library}</small>
+      <span class="grow"></span>${many}</h3>
     <p>${one.sentence}</p>
-    ${told?.spots.length ? html`<svg viewBox="0 0 250 18" preserveAspectRatio="none" shape-rendering="crispEdges"
-      aria-hidden="true">
-      <rect class="bar-back" width="250" height="18" />${told.spots.map((at) => html`<rect class="bar-match" x=${at}
-        width="1" height="18" />`)}</svg>` : null}
+    ${one.kind === "property" ? null : html`<svg viewBox="0 0 250 18" preserveAspectRatio="none"
+      shape-rendering="crispEdges" aria-hidden="true">
+      <rect class="bar-back" width="250" height="18" />${told?.spots.map((at) => html`<rect class="bar-match" x=${at}
+        width="1" height="18" />`)}</svg>`}
     ${one.drawing ? html`<pre aria-hidden="true">${one.drawing}</pre>` : null}</button>`;
 }
 
 /** Cards and words of the language that come near some words. @param {{text: string, most?: number}} props */
 export function Near({ text, most = MOST_CARDS }) {
-  const near = useNear(text);
-  if (!near) return null;
-  const { cards } = near, some = nearWords(near.of);
+  const { cards, error } = useNear(text);
+  if (!text) return null;
+  if (error) return html`<p class="error" role="alert">${error}</p>`;
+  if (!cards) {
+    return html`<p class="row faint" role="status"><span class="busy" aria-hidden="true"></span>
+      searching … <${Elapsed} key=${text} /></p>`;
+  }
+  const some = nearWords(text);
   return html`${cards.length ? html`<div class="cards near-cards">
     ${cards.slice(0, most).map((one) => html`<${Card} one=${one} />`)}</div>` : null}
     ${some.length ? html`<h2>Words of the language</h2><ul class="words">${some.map((one) => html`<li>
@@ -150,18 +159,20 @@ export const WordSearch = () => html`<input type="search" class="words-field"
     onInput=${(/** @type {{target: HTMLInputElement}} */ e) => { sought.value = e.target.value; }}
   onKeyDown=${(/** @type {KeyboardEvent} */ e) => { if (e.key === "Escape") sought.value = ""; }} />`;
 
+/** The counts by which the cards are sorted; null: they are not. Cards move on a click only, not as counts come. */
+const foundFirst = signal(/** @type {typeof tally.value | null} */ (null));
+
 export function Start() {
   const some = library.value.filter((one) => one.kind !== "predicate"),
     kinds = [...new Set(some.map((one) => one.library))];
-  const over = useRef(false), known = useRef(tally.value); // no card moves away from under the pointer
-  if (!over.current) known.current = tally.value;
-  const found = (/** @type {Entry} */ one) => Number((known.current[one.name]?.count || 0) > 0),
-    text = sought.value.trim();
-  return html`<div class="sheet" tabindex="0" onPointerEnter=${() => { over.current = true; }}
-    onPointerLeave=${() => { over.current = false; }}>
+  const known = foundFirst.value, text = sought.value.trim();
+  const found = (/** @type {Entry} */ one) => Number((known?.[one.name]?.count || 0) > 0);
+  return html`<div class="sheet" tabindex="0">
     ${text ? html`<${Near} text=${text} />` : !some.length ? html`<p class="faint">Reading the library …</p>`
       : html`<p class="faint">Type a pattern above, search in words, or begin with one of these ${some.length}.
-      Each card has its matches in this store, and where they are in time.</p>
+      Each card has its matches in this store, and where they are in time.
+      ${" "}<button class="small" aria-pressed=${known !== null}
+        onClick=${() => { foundFirst.value = known ? null : tally.value; }}>those with matches first</button></p>
       ${kinds.map((kind) => html`<h2>${kind}</h2><div class="cards">
         ${some.filter((one) => one.library === kind).sort((a,
           b) => found(b) - found(a)).map((one) => html`<${Card} one=${one} />`)}</div>`)}`}</div>`;

@@ -10,18 +10,18 @@ import { Gallery } from "./gallery.js";
 import { Above, keys } from "./keys.js";
 import { Scene } from "./scene.js";
 import { Compare } from "./compare.js";
-import { countLibrary, Near, sought, Start, WordSearch } from "./library.js";
+import { countLibrary, Near, Start, WordSearch } from "./library.js";
 import { Selection } from "./select.js";
 import { Coverage } from "./sheets.js";
 import {
   answer, ask, askAgain, cancel, changed, dialog, find, history, isPattern, keep, library, matches, namesIn, notes,
     notice, open,
-  openFrame, paints, parametersOf, reasonOf, refresh, retries, say, store, tag, tagged, text, theme, ticked, values,
+  openFrame, paints, parametersOf, reasonOf, refresh, retries, say, sought, store, tag, tagged, text, theme, ticked, values,
     view, words,
 } from "./state.js";
-import { Status } from "./status.js";
+import { Elapsed, Status } from "./status.js";
 import { runsOfTags } from "./timeline.js";
-import { Verdicts } from "./verdicts.js";
+import { Rows, Verdicts } from "./verdicts.js";
 
 const html = htm.bind(h);
 const VIEWS = [["find", "Find"], ["coverage", "Coverage"], ["selection", "Selection"], ["compare", "Compare"]];
@@ -76,32 +76,15 @@ function Search() {
         onInput=${(/** @type {{target: HTMLInputElement}} */ e) => { values.value = { ...values.value,
           [name]: e.target.value }; }}
         onKeyDown=${(/** @type {any} */ e) => { if (e.key === "Enter") find(); }} /></label>`)}
-      <${NumberSlider} /><span class="grow"></span>
+      ${sought.value.trim() ? null : html`<${NumberSlider} />`}<span class="grow"></span>
       ${answer.value.state === "busy" ? html`<button onClick=${cancel}>Stop</button>` : null}
       <button class="main" onClick=${() => find()}>Find <kbd>
         ${navigator.platform.startsWith("Mac") ? "Cmd" : "Ctrl"} Enter</kbd></button>
     </div></section>`;
 }
 
-function Rows() {
-  const { columns, rows } = answer.value;
-  return html`<div class="sheet" tabindex="0"><table><thead><tr>
-    ${columns.map((/** @type {string} */ c, /** @type {number} */ i) => html`<th
-    class=${rows.some((/** @type {any[]} */ row) => typeof row[i] === "number") ? "number" : ""}>${c}</th>`)}</tr>
-    </thead>
-    <tbody>${rows.slice(0, 2000).map((/** @type {any[]} */ row) => html`<tr>
-      ${row.map((v) => html`<td class=${typeof v === "number" ? "number" : ""}>${shown(v)}</td>`)}</tr>`)}</tbody>
-      </table>
-    ${rows.length > 2000 ? html`<p class="note">2,000 of ${rows.length} rows are shown; add LIMIT or a condition</p>`
-      : null}</div>`;
-}
-
 /** @param {{first: number, last: number}} frames */
 const spanOf = ({ first, last }) => `#${first}${last > first ? `–${last}` : ""}`;
-
-/** @param {any} v */
-const shown = (v) => (v === null ? "" : typeof v === "object" ? JSON.stringify(v) : typeof v === "number"
-  && !Number.isInteger(v) ? String(Number(v.toPrecision(7))) : String(v));
 
 function TagForm() {
   const now = open.value, match = now?.match, chosen = tagged.value;
@@ -166,15 +149,13 @@ function Nothing() {
   }
   const placed = Number.isInteger(error.start), { start, end } = placed ? error : { start: 0, end: chars.length },
     stop = Math.max(end, start + 1);
-  const before = chars.slice(0, start).join(""), word = chars.slice(start, stop).join(""),
-    line = before.split("\n").length;
+  const before = chars.slice(0, start).join(""), word = chars.slice(start, stop).join("");
   const better = /did you mean '([^']+)'\?/.exec(error.hint || "")?.[1],
     pattern = /\b(?:MATCH|CHECK|DEFINE|USING|SELECT|WITH|FROM)\b/.test(query);
   const mend = () => { text.value = placed ? `${before}${better}${chars.slice(end).join("")}`
     : `${better}`; find(); };
   return html`<div class="sheet">${placed ? html`<pre class="wrong">${before}<mark>${word || " "}</mark>
     ${chars.slice(stop).join("")}</pre>` : null}
-    <p class="error">${placed ? `line ${line}, column ${start - before.lastIndexOf("\n")}: ` : ""}${error.reason}</p>
     ${better ? html`<p>Did you mean <button class="main" onClick=${mend}>${better}</button></p>` : error.hint
       ? html`<p>${error.hint}</p>` : null}
     <h2>Near this</h2><${Near} text=${pattern ? word.replace(/([a-z])([A-Z])/g, "$1 $2") : query} most=${6} /></div>`;
@@ -187,14 +168,24 @@ function Nearest({ query }) {
     const mine = new AbortController();
     tell(null);
     if (isPattern(query)) api.json("api/nearest", { text: query, parameters: parametersOf(query) },
-      { signal: mine.signal }).then(tell, () => {});
+      { signal: mine.signal }).then(tell, (error) => {
+        if (!mine.signal.aborted) tell({ error: { reason: reasonOf(error) } });
+      });
     return () => mine.abort();
   }, [query]);
-  if (!told?.failed) return null;
+  if (!isPattern(query)) return null;
+  if (!told) return html`<p class="row faint" role="status"><span class="busy" aria-hidden="true"></span>
+    looking for the part that is never true … <${Elapsed} key=${query} /></p>`;
+  if (told.error) return html`<p class="error" role="alert">${told.error.reason}</p>`;
+  if (!told.failed) return html`<p class="nearest" role="status">Each part of the pattern is true in some frame,
+    but never in this order or for this long.</p>`;
   const go = () => { openFrame(told.trace, told.seq); askWhy(); };
-  return html`<p class="nearest" role="status">No frame of the store has <code>${told.failed}</code>${told.found
-    ? html`. The nearest is <code>${told.found}</code>: <button onClick=${go}>${told.trace}#${told.seq}</button>`
-      : "."}</p>`;
+  const others = (told.others || []).map((/** @type {string} */ one, /** @type {number} */ i) => html`${i ? " and " : ""}
+    <code>${one}</code>`);
+  return html`<p class="nearest" role="status">No frame of the store has <code>${told.failed}</code>${others.length
+    ? html` together with ${others}` : null}. ${told.trace === undefined ? null : html`${told.found
+      ? html`The nearest is <code>${told.found}</code>` : "A frame with the other parts"}:
+      ${" "}<button onClick=${go}>${told.trace}#${told.seq}</button>`}</p>`;
 }
 
 function App() {

@@ -3,6 +3,7 @@
 import { h, htm, signal } from "../vendor/core.js";
 import { panel } from "./clock.js";
 import { egoRow, rowOf, SCENERY, spotOf } from "./draw.js";
+import { placed } from "./labels.js";
 import { chosen, lit, open } from "./state.js";
 
 /** @typedef {import("./data.js").States} States */
@@ -49,7 +50,7 @@ function hopOf(graph, bound, placeOf, most) {
 /** Where nodes stand in the panel: in their direction, those far away less far. @param {number[]} nodes
  * @param {(node: number) => number[] | null} placeOf
  * @param {Set<number>} bound @param {number} turn @param {(node: number) => string} name
- * @param {[number, number]} size of the panel */
+ * @param {[number, number]} size of the panel @returns {Map<number, import("./labels.js").Box>} */
 function layout(nodes, placeOf, bound, turn, name, [WIDE, HIGH]) {
   const of = nodes.filter((n) => bound.has(n)).map((n) => placeOf(n) || [0, 0]), many = Math.max(of.length, 1);
   const cx = of.reduce((s, [x]) => s + (x || 0), 0) / many, cy = of.reduce((s, [, y]) => s + (y || 0), 0) / many;
@@ -79,7 +80,13 @@ function layout(nodes, placeOf, bound, turn, name, [WIDE, HIGH]) {
       }
     }
   }
-  return new Map(spots.map(({ node, x, y }) => [node, [x, y]]));
+  // A node that still lies on another one goes to the nearest free place; without one it is left out.
+  const away = [...Array(9).keys()].flatMap((i) => [...Array(9).keys()].map((k) => [(i - 4) * 40, (k - 4) * 26]))
+    .sort(([a = 0, b = 0], [c = 0, d = 0]) => Math.hypot(a, b) - Math.hypot(c, d));
+  const boxes = placed(spots.map(({ x, y, wide }) => away.map(([right = 0, down = 0]) => ({
+    x: Math.min(Math.max(x + right - wide / 2, 2), WIDE - wide - 2), y: Math.min(Math.max(y + down - 11, 3), HIGH - 25),
+    wide, high: 22 }))), [], 2);
+  return new Map(spots.flatMap(({ node }, i) => { const box = boxes[i]; return box ? [[node, box]] : []; }));
 }
 
 /** @param {{graph: any, states: States | null, north: boolean}} props */
@@ -105,13 +112,29 @@ export function Neighbours({ graph, states, north }) {
   const at = layout(shown, placeOf, bound, north || !Number.isFinite(heading) ? 0 : Math.PI / 2 - heading, name,
     size);
   const drawn = edges.filter(({ src, dst }) => at.has(src) && at.has(dst));
+  const middleOf = (/** @type {number} */ node) => {
+    const { x, y, wide, high } = at.get(node) || { x: 0, y: 0, wide: 0, high: 0 };
+    return [x + wide / 2, y + high / 2];
+  };
+  // Names of relations: of the bound nodes and of what is pointed at first; of the others where they are few.
+  const named = drawn.map((edge) => ({ ...edge, inside: bound.has(edge.src) && bound.has(edge.dst),
+    on: lit.value.has(edge.src) && lit.value.has(edge.dst) })).filter(({ on, inside }) => on || inside || drawn.length < 5)
+    .sort((a, b) => Number(b.inside) - Number(a.inside) || Number(b.on) - Number(a.on)).map((edge) => {
+      const words = [...edge.labels], text = words.length > 2 && !edge.on ? `${words[0]} +${words.length - 1}`
+        : words.join(", "), [ax = 0, ay = 0] = middleOf(edge.src), [bx = 0, by = 0] = middleOf(edge.dst);
+      const wide = text.length * 5.6 + 4;
+      return { ...edge, text, spots: [0.5, 0.4, 0.6, 0.3, 0.7].flatMap((part) => [-12, 2, -24, 14].map((down) => ({
+        x: ax + (bx - ax) * part - wide / 2, y: ay + (by - ay) * part + down, wide, high: 12 }))) };
+    });
+  const words = placed(named.map(({ spots }) => spots), [...at.values()]);
+  const hidden = left + shown.length - at.size;
   const told = drawn.map(({ src, dst, both, labels }) => ({ src, dst, both, label: [...labels].join(", "),
     holds: null }));
   queueMicrotask(() => { if (JSON.stringify(hop.peek()) !== JSON.stringify(told)) hop.value = told; });
   return html`<div class="scroll near"><svg viewBox=${`0 0 ${size[0]} ${size[1]}`} role="group"
     aria-label="Neighbours">
       ${drawn.map(({ src, dst, labels, both }) => {
-        const [ax, ay] = at.get(src) || [0, 0], [bx, by] = at.get(dst) || [0, 0],
+        const [ax, ay] = middleOf(src), [bx, by] = middleOf(dst),
           inside = bound.has(src) && bound.has(dst), on = lit.value.has(src) && lit.value.has(dst);
         const words = [...labels];
         return html`<g class=${on || inside ? "holds" : "faint"} stroke="currentColor"
@@ -120,8 +143,8 @@ export function Neighbours({ graph, states, north }) {
             <path d=${`M${ax} ${ay}L${bx} ${by}`} stroke-width=${on ? 3 : inside ? 2 : 1} />
             <path d=${`M${ax} ${ay}L${bx} ${by}`} stroke="transparent" stroke-width="9" /></g>`;
       })}
-      ${[...shown].sort((a, b) => Number(a >= 0) - Number(b >= 0)).map((node) => {
-        const [x, y] = at.get(node) || [0, 0], one = name(node), wide = widthOf(one);
+      ${[...at].sort(([a], [b]) => Number(a >= 0) - Number(b >= 0)).map(([node, { x: left, y: top, wide }]) => {
+        const one = name(node);
         return html`<g key=${node} style=${{ cursor: node >= 0 ? "pointer" : "default" }}
           role=${node >= 0 ? "button" : undefined} tabindex=${node >= 0 ? 0 : undefined}
           aria-label=${about.get(node)?.name || one}
@@ -130,19 +153,16 @@ export function Neighbours({ graph, states, north }) {
             onMouseLeave=${() => { lit.value = new Set(); }}
           onClick=${() => { if (node >= 0) { chosen.value = node; panel.value = "near"; } }}><title>
             ${about.get(node)?.name || node}</title>
-          <rect x=${(x || 0) - wide / 2} y=${(y || 0) - 11} width=${wide} height="22" rx=${node < 0 ? 4 : 11}
+          <rect x=${left} y=${top} width=${wide} height="22" rx=${node < 0 ? 4 : 11}
             fill=${bound.has(node) ? "var(--soft)" : "var(--raised)"}
             stroke=${bound.has(node) ? "var(--mark)" : lit.value.has(node) ? "var(--accent)" : "var(--line)"}
             stroke-width=${bound.has(node) ? 2 : 1.2} />
-          <text x=${x} y=${(y || 0) + 3.5} font-size="10" font-weight=${bound.has(node) ? 600 : 400}
+          <text x=${left + wide / 2} y=${top + 14.5} font-size="10" font-weight=${bound.has(node) ? 600 : 400}
             text-anchor="middle" fill="var(--ink)">${one}</text></g>`;
-      })}${drawn.map(({ src, dst, labels }) => { // names of relations above all nodes
-        const [ax = 0, ay = 0] = at.get(src) || [], [bx = 0, by = 0] = at.get(dst) || [],
-          inside = bound.has(src) && bound.has(dst), on = lit.value.has(src) && lit.value.has(dst);
-        const words = [...labels], text = words.length > 2 && !on ? `${words[0]} +${words.length - 1}`
-          : words.join(", ");
-        return on || inside || drawn.length < 5 ? html`<text class="halo" x=${(ax + bx) / 2} y=${(ay + by) / 2 - 3}
+      })}${named.map(({ on, inside, text }, i) => { // names of relations above all nodes
+        const box = words[i];
+        return box ? html`<text class="halo" x=${box.x + box.wide / 2} y=${box.y + 9.5}
           font-size="9.5" text-anchor="middle" pointer-events="none"
           fill=${on || inside ? "var(--hold)" : "var(--faint)"}>${text}</text>` : null;
-      })}</svg>${left > 0 ? html`<p class="faint">and ${left} more: scenery, or farther away</p>` : null}</div>`;
+      })}</svg>${hidden > 0 ? html`<p class="faint">and ${hidden} more: scenery, or farther away</p>` : null}</div>`;
 }

@@ -9,6 +9,9 @@ const text = document.getElementById("kept")?.textContent || "{}";
  *   pictures: Record<string, Record<string, string>>}} */
 export const kept = JSON.parse(text);
 
+/** Why the server does not answer: there is none. */
+export const trouble = { value: "" };
+
 /** The key under which an answer is kept. @param {string} path @param {Plain} values */
 export function address(path, values) {
   return JSON.stringify([path, ...Object.values(values)]);

@@ -3,6 +3,9 @@
 
 /** @typedef {import("./state.js").Match} Match */
 
+/** The word of the order of the store, if the query has one of its own. */
+export const BY_QUERY = "as the query orders them";
+
 /** Orders by their words. @type {Record<string, string>} */
 export const ORDERS = { "": "by trace", long: "longest first", short: "shortest first", random: "random",
   spread: "spread over traces" };

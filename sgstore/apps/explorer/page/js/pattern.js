@@ -1,6 +1,7 @@
 // @ts-check
 // The pattern as a small drawing that stays still, while its edges and conditions turn ✓ or ✗.
 import { h, htm, useMemo } from "../vendor/core.js";
+import { allHold, written } from "./lanes.js";
 import { lit, open } from "./state.js";
 
 const html = htm.bind(h);
@@ -37,12 +38,12 @@ function places(keys, edges) {
 export function PatternDrawing({ lanes, holds }) {
   const drawn = useMemo(() => {
     if (!lanes) return null;
-    const labels = new Map(), edges = /** @type {any[]} */ ([]), conditions = /** @type {any[]} */ ([]);
+    const labels = new Map(), edges = /** @type {any[]} */ ([]);
     lanes.lanes.forEach((/** @type {any} */ lane, /** @type {number} */ at) => {
       for (const [key, label] of Object.entries(lane.nodes)) labels.set(key, label);
       for (const edge of lane.edges) edges.push({ ...edge, at });
-      for (const condition of lane.conditions) conditions.push({ condition, at });
     });
+    const conditions = conditionsOf(lanes.lanes);
     const keys = [...labels.keys()];
     const { found: at, width, height } = places(keys, edges);
     return { labels, edges, conditions, at, width, height };
@@ -82,7 +83,29 @@ export function PatternDrawing({ lanes, holds }) {
       <text x=${x} y=${y + 10} font-size="8.5" text-anchor="middle" fill="var(--faint)">
         ${String(drawn.labels.get(key) || "").slice(0, 14)}</text></g>`)}
   </svg>
-    <ul>${drawn.conditions.map((/** @type {any} */ one) => html`<li class=${state(one.at)}><b>
-      ${holds[one.at] ? "✓" : holds[one.at] === false ? "✗" : "·"}</b> <code>${one.condition}</code></li>`)}</ul>
-      </div>`;
+    <ul class="conditions">${drawn.conditions.map(({ text, of, meanings }) => html`<li>${meanings.length
+      ? html`<details><summary><${Sign} of=${of} holds=${holds} /> <code>${text}</code></summary><ul>
+        ${meanings.map(({ text, at }) => html`<li><${Sign} of=${[at]} holds=${holds} /> <code>${text}</code></li>`)}
+        </ul></details>` : html`<${Sign} of=${of} holds=${holds} /> <code>${text}</code>`}</li>`)}</ul></div>`;
+}
+
+/** Whether some lanes hold, as a sign. @param {{of: number[], holds: (boolean | null)[]}} props */
+function Sign({ of, holds }) {
+  const all = allHold(of.map((at) => holds[at]));
+  return html`<b class=${all === null ? "faint" : all ? "holds" : "fails"}>${all === null ? "·" : all ? "✓" : "✗"}</b>`;
+}
+
+/** Conditions as the query writes them, with the lanes of each; words of the library also with their meaning.
+ * @param {import("./lanes.js").Lane[]} lanes
+ * @returns {{text: string, of: number[], meanings: {text: string, at: number}[]}[]} */
+export function conditionsOf(lanes) {
+  return written(lanes).flatMap(({ text, of }) => {
+    const one = lanes[of[0] ?? 0];
+    if (!one) return [];
+    if (one.call) {
+      return [{ text, of, meanings: of.flatMap((at) => (lanes[at]?.meanings || []).map((text) => ({ text, at }))) }];
+    }
+    return one.conditions.map((text, i) => ({ text, of, meanings: (one.meanings[i] || text) === text ? []
+      : of.map((at) => ({ text: one.meanings[i] || "", at })) }));
+  });
 }

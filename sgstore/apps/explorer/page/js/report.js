@@ -6,7 +6,7 @@ import { Gallery } from "./gallery.js";
 import { Above, keys } from "./keys.js";
 import { kept } from "./offline.js";
 import { Scene } from "./scene.js";
-import { Verdicts } from "./verdicts.js";
+import { Rows, Verdicts } from "./verdicts.js";
 import { answer, dialog, find, matches, notes, offline, open, store, text, values } from "./state.js";
 import { Status } from "./status.js";
 
@@ -24,7 +24,7 @@ function Head() {
 function Report() {
   const told = answer.value;
   const body = open.value ? html`<main class="open"><${Gallery} found=${matches.value} /><${Scene} /></main>`
-    : told.verdicts ? html`<${Verdicts} /><main><${Gallery} found=${matches.value} /></main>`
+    : told.rows ? html`<${Rows} />` : told.verdicts ? html`<${Verdicts} /><main><${Gallery} found=${matches.value} /></main>`
     : told.state === "done" && !told.matches.length ? html`<div class="sheet"><h2>Nothing matches</h2></div>`
       : html`<main><${Gallery} found=${matches.value} /></main>`;
   return html`<${Head} /><${Status} />${body}

@@ -63,14 +63,16 @@ function Camera() {
 
 const legend = signal(false);
 
-/** The node under the pointer. @param {{x: number, y: number, node: number, trace: string, states: States | null}} props */
+/** The node under the pointer, with its variable: its name may have no room in the view.
+ * @param {{x: number, y: number, node: number, trace: string, states: States | null}} props */
 function Tip({ x, y, node, trace, states }) {
   const row = states ? rowOf(states, node) : -1, c = states?.columns;
   if (row < 0 || !c) return null;
   const kind = kindOf(c.kind[row]), speed = Number.isFinite(c.speed[row]) ? ` · ${c.speed[row].toFixed(1)} m/s` : "";
   const more = kind === "traffic_light" ? ` · ${lightOf(c.light?.[row] ?? 0)}` : speed;
+  const key = Object.entries(open.value?.binding || {}).find(([, bound]) => bound === node)?.[0];
   return html`<div class="tip" role="tooltip" style=${{ left: `${x + 12}px`, top: `${y + 12}px` }}>
-    ${nameOf(trace, node)}${more}</div>`;
+    ${key ? `${key} · ` : ""}${nameOf(trace, node)}${more}</div>`;
 }
 
 /** What the colours and forms stand for. @param {{trace: string, states: States | null}} props */

@@ -117,7 +117,7 @@ export function useWork(path, body) {
 
 /** What stands in the place of an answer while it is under way. @param {{told: any, children?: any}} props */
 export function Waiting({ told, children }) {
-  if (told.error) return html`<p class="error" role="alert">${told.error}</p>`;
+  if (told.error && told.error !== api.trouble.value) return html`<p class="error" role="alert">${told.error}</p>`;
   if (told.stopped) return html`<p class="row">stopped <button onClick=${told.start}>start again</button></p>`;
   if (told.found) return children(told.found);
   return html`<p class="row faint" role="status"><span class="busy" aria-hidden="true">

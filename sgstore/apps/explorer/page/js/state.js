@@ -19,9 +19,11 @@ export const tally = signal(
   /** @type {Record<string, {count: number, more: string, spots: number[], reason: string}>} */ ({}));
 export const view = signal("find");
 export const text = signal("");
+/** Words that are sought in the library and the vocabulary. */
+export const sought = signal("");
 /** Values of $name. */
 export const values = signal(/** @type {Record<string, string>} */ ({}));
-const NO_ANSWER = { state: "idle", matches: [], names: [], reasons: {}, notes: [] };
+const NO_ANSWER = { state: "idle", matches: [], names: [], reasons: {}, notes: [], lists: "" };
 export const answer = signal(/** @type {any} */ (NO_ANSWER));
 export const filter = signal({ trace: "", map: "" });
 export const order = signal("");
@@ -100,6 +102,7 @@ export const isPattern = (query) => /\bMATCH\b/i.test(query)
 
 /** The last word of the page on a fault or an act. @param {string} message */
 export function say(message) {
+  if (message === api.trouble.value) return; // it stands above the page
   toast.value = message;
   setTimeout(() => { if (toast.value === message) toast.value = ""; }, 3500);
 }
@@ -168,8 +171,8 @@ export function ask(query) {
   return find();
 }
 
-/** Ask for the matches of the text in the editor; true: no other query came meanwhile.
- * @param {{keep?: boolean}} [how] */
+/** Ask for the matches of the text in the editor, or for its rows; true: no other query came meanwhile.
+ * @param {{keep?: boolean, rows?: boolean}} [how] */
 export async function find(how = {}) {
   const query = text.value.trim();
   if (!query) {
@@ -183,7 +186,7 @@ export async function find(how = {}) {
   const began = performance.now();
   /** @type {any} */
   const told = { state: "busy", id, query, parameters, matches: [], names: [], reasons: {}, notes: [], columns: [],
-    rows: null };
+    rows: null, lists: "" };
   batch(() => {
     answer.value = { ...told };
     if (!how.keep) open.value = null;
@@ -202,11 +205,12 @@ export async function find(how = {}) {
       return true;
     }
     let last = 0;
-    for await (const line of api.lines("api/find", { text: query, parameters, id }, { signal: mine.signal })) {
+    const body = { text: query, parameters, id, ...(how.rows ? { ask: "rows" } : {}) };
+    for await (const line of api.lines("api/find", body, { signal: mine.signal })) {
       await follow(line.stamp);
       if (line.names) told.names = line.names;
       if (line.matches) for (const row of line.matches) told.matches.push(matchOf(row, told));
-      for (const name of ["reasons", "columns", "rows", "notes", "count", "truncated", "error"]) {
+      for (const name of ["reasons", "columns", "rows", "notes", "count", "truncated", "lists", "error"]) {
         if (line[name] !== undefined) told[name] = name === "error" ? here(line.error) : line[name];
       }
       if (performance.now() - last > 120) { last = performance.now(); answer.value = { ...told }; }
@@ -268,6 +272,7 @@ export async function* matchesIn(lines, more) {
   const told = { names: [], matches: { length: 0 } };
   for await (const line of lines) {
     if (line.error) throw new Error(line.error.reason);
+    if (line.rows) throw new Error("The query returns values of several matches: remove RETURN, LIMIT and ORDER BY.");
     if (line.names) told.names = line.names;
     for (const row of line.matches || []) { yield matchOf(row, told); told.matches.length++; }
     if (line.truncated) more(told.matches.length);

@@ -1,8 +1,9 @@
 // @ts-check
 // What was found, in a line: how much, how long it took, who cannot answer.
 import { h, htm, useEffect, useState } from "../vendor/core.js";
-import { ORDERS } from "./order.js";
-import { answer, filter, framesFound, matches, offline, order, store, tickAll } from "./state.js";
+import * as api from "./api.js";
+import { BY_QUERY, ORDERS } from "./order.js";
+import { answer, filter, find, framesFound, isPattern, matches, offline, open, order, sought, store, tickAll } from "./state.js";
 
 const html = htm.bind(h);
 
@@ -17,17 +18,38 @@ export function Elapsed() {
   return html`${seconds} s`;
 }
 
+/** The reason of an error, with its place in the query; not again what stands above the page. @param {any} error */
+function reasonShown({ reason, start }) {
+  if (reason === api.trouble.value) return "not answered yet";
+  if (!Number.isInteger(start)) return reason;
+  const before = [...answer.value.query].slice(0, start).join(""), line = before.split("\n").length;
+  return `line ${line}, column ${start - before.lastIndexOf("\n")}: ${reason}`;
+}
+
+/** What RETURN asks for beside the matches, and the way to it. */
+function Form() {
+  const { state, query, rows, lists, columns, verdicts } = answer.value;
+  if (state !== "done" || verdicts || !isPattern(query)) return null;
+  if (lists === "values") {
+    return html`<span class="note">The table has what RETURN asks for. Without RETURN, the matches are pictures.</span>`;
+  }
+  if (offline.value) return null;
+  return html`${rows || lists === "chosen" || columns[0] === "frame_id" ? null
+    : html`<span class="note">The pictures are the matches; the table has the values of RETURN.</span>`}
+    <button class="small" onClick=${() => find({ rows: !rows })}>${rows ? "pictures" : "table"}</button>`;
+}
+
 export function Status() {
   const told = answer.value, { frames, traces: many } = framesFound.value, found = matches.value.length;
   const left = Object.entries(told.reasons || {});
-  if (told.state === "idle") return null;
+  if (told.state === "idle" || sought.value.trim()) return null;
   const where = filter.value, all = /** @type {import("./state.js").Trace[]} */ (store.value.traces);
   const known = { trace: all.map((t) => t.name), map: [...new Set(all.map((t) => t.map).filter(Boolean))] };
   return html`<div class="status" role="status" aria-live="polite">
     ${told.state === "busy" ? html`<span class="busy" aria-hidden="true"></span>
       <span class="asking">asking … <${Elapsed} key=${told.id} /></span>` : null}
-    ${told.error ? html`<div class="error"><b>${told.error.reason}</b>
-      ${told.error.hint ? html` · ${told.error.hint}` : null}</div>`
+    ${told.error ? html`<div class="error"><b>${reasonShown(told.error)}</b>
+      ${told.error.hint && open.value ? html` · ${told.error.hint}` : null}</div>`
       : told.rows ? html`<span><b>${told.rows.length.toLocaleString("en")}</b> rows</span>`
       : html`<span><b>${found.toLocaleString("en")}</b> ${told.verdicts ? (found === 1 ? "violation" : "violations")
         : found === 1 ? "match" : "matches"} in ${many} ${many === 1 ? "trace"
@@ -48,7 +70,9 @@ export function Status() {
       <option value="">${`all ${of}s`}</option>${known[of].map((one) => html`<option>${one}</option>`)}</select>`))}
     ${found > 1 && !told.rows ? html`<select aria-label="order" value=${order.value}
       onChange=${(/** @type {{target: HTMLInputElement}} */ e) => { order.value = e.target.value; }}>
-      ${Object.entries(ORDERS).map(([key, word]) => html`<option value=${key}>${word}</option>`)}</select>` : null}
+      ${Object.entries(ORDERS).map(([key, word]) => html`<option value=${key}>${key || told.lists !== "chosen" ? word
+        : BY_QUERY}</option>`)}</select>` : null}
+    <${Form} />
     ${found && !told.rows && !offline.value ? html`<button class="small"
       onClick=${() => tickAll(matches.value)}>select all</button>` : null}
   </div>`;

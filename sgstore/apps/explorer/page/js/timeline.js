@@ -1,8 +1,9 @@
 // @ts-check
 // The whole trace in time: matches, a lane for each part of the pattern, tags, values; drag to go there.
-import { computed, effect, h, htm, signal, useRef } from "../vendor/core.js";
+import { computed, effect, h, htm, signal, useRef, useState } from "../vendor/core.js";
 import { frame, goTo, holdsAt, lanes, range, series } from "./clock.js";
 import { arrived, seconds, seqAt, timeAt } from "./data.js";
+import { allHold, common, written } from "./lanes.js";
 import { answer, dialog, keyOf, lit, live, matches, notes, offline, open, playing, tagged, traces } from "./state.js";
 
 const html = htm.bind(h);
@@ -189,6 +190,29 @@ export function runsOfTags(all, trace) {
   return runs;
 }
 
+/** The lane of a part as written; that of a word of the library opens to the lanes of its meaning.
+ * @param {{part: import("./lanes.js").Written, all: import("./lanes.js").Lane[], holds: (boolean | null)[],
+ *   steps: boolean}} props */
+function Part({ part, all, holds, steps }) {
+  const [isOpen, turn] = useState(false), bound = open.value?.binding || {}, lanes = part.of.flatMap((at) => all[at] || []);
+  const row = (/** @type {typeof lanes} */ some, /** @type {string} */ text, /** @type {boolean | null} */ now,
+    /** @type {any} */ before) => {
+    const nodes = some.flatMap((lane) => Object.keys(lane.nodes)).flatMap((key) => bound[key] ?? []);
+    const unknown = some.flatMap((lane) => lane.unknown);
+    return html`<div class="lane" data-holds=${String(now)} onMouseEnter=${() => { lit.value = new Set(nodes); }}
+      onMouseLeave=${() => { lit.value = new Set(); }}>
+      <div class="label mono" title=${unknown.length ? `nothing is known of ${unknown.join(", ")}` : text}>
+        <span class=${`now ${now ? "holds" : "fails"}`}>${now === null ? "?" : now ? "✓" : "✗"}</span>${before}${text}
+        </div><${Bars} spans=${common(some.map((lane) => lane.spans))} kind=${() => "bar-hold"} /></div>`;
+  };
+  const step = steps ? `${part.step}. ` : "", now = allHold(part.of.map((at) => holds[at]));
+  if (lanes.length < 2) return row(lanes, part.text, now, step);
+  return html`${row(lanes, part.text, now, html`${step}<button class="quiet small opener" aria-expanded=${isOpen}
+    aria-label=${`Parts of ${part.text}`} onClick=${() => turn(!isOpen)}>${isOpen ? "▾" : "▸"}</button>`)}
+    ${isOpen ? part.of.map((at) => row([all[at]].flatMap((one) => one || []),
+      all[at]?.text || "", holds[at] ?? null, html`<span class="inner"></span>`)) : null}`;
+}
+
 export function Timeline() {
   const now = open.value, about = traces.value.get(now?.trace || "");
   if (!now || !about) return null;
@@ -207,16 +231,8 @@ export function Timeline() {
       <${Bars} spans=${first.map((m) => [m.first, m.last])}
         kind=${(/** @type {number} */ i) => (first[i] && now.match && keyOf(first[i]) === keyOf(now.match)
           ? "bar-match" : "bar-match other")} /></div>
-    ${all.map((/** @type {any} */ lane, /** @type {number} */ i) => {
-      const nodes = Object.keys(lane.nodes).map((key) => now.binding?.[key]).filter((n) => n !== undefined);
-      return html`<div class="lane" key=${i} data-holds=${String(holds[i])}
-        onMouseEnter=${() => { lit.value = new Set(/** @type {number[]} */ (nodes)); }}
-        onMouseLeave=${() => { lit.value = new Set(); }}>
-        <div class="label mono" title=${lane.unknown.length ? `nothing is known of ${lane.unknown.join(", ")}`
-          : lane.text}><span class=${`now ${holds[i] ? "holds" : "fails"}`}>
-          ${holds[i] === null ? "?" : holds[i] ? "✓" : "✗"}</span>${steps ? `${lane.step}. ` : ""}${lane.text}</div>
-        <${Bars} spans=${lane.spans} kind=${() => "bar-hold"} /></div>`;
-    })}
+    ${written(all).map((one) => html`<${Part} key=${`${one.step} ${one.of[0]}`} part=${one} all=${all} holds=${holds}
+      steps=${steps} />`)}
     ${tags.length ? html`<div class="lane"><div class="label">
       ${tags.length} ${tags.length === 1 ? "tag" : "tags"}</div>
       <${Bars} spans=${tags.map((n) => [n.first, Math.max(n.last, n.first + frames / 200)])}

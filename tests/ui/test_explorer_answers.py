@@ -1,0 +1,282 @@
+"""Answers in the explorer: their order, sentences without a match, words as written, labels, errors.
+
+All tests share one page. Each begins with the library.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any, Final
+
+import pytest
+from explorer_page import NEAR, expect, open_first, search
+
+from sgstore.query import Store
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+pytestmark = pytest.mark.seconds(30)
+
+
+@pytest.fixture(scope="module")
+def shared(
+    browser: Any, served: Callable[[Path], str], town_store: Path
+) -> Iterator[tuple[Any, list[str]]]:
+    """A page, and what was wrong on its console."""
+    wrong = list[str]()
+    context = browser.new_context(viewport={"width": 1440, "height": 900})
+    page = context.new_page()
+    page.set_default_timeout(60_000)
+    page.on("pageerror", lambda error: wrong.append(str(error)))
+    page.goto(served(town_store))
+    yield page, wrong
+    context.close()
+
+
+@pytest.fixture
+def page(shared: tuple[Any, list[str]]) -> Iterator[Any]:
+    page, wrong = shared
+    page.get_by_role("button", name="Find", exact=True).click()
+    page.get_by_role("button", name="sgstore", exact=True).click()
+    page.locator(".card").first.wait_for()
+    yield page
+    page.unroute_all()
+    assert wrong == []
+
+
+def hold(page: Any, path: str) -> Callable[[], None]:
+    """Hold the answers of a path back; the result lets them go."""
+    held = list[Any]()
+
+    def keep(route: Any) -> None:
+        held.append(route)
+
+    page.route(path, keep)
+
+    def release() -> None:
+        for route in held:
+            route.continue_()
+        page.unroute(path)
+
+    return release
+
+
+CHOSEN: Final = {
+    "ORDER BY gap(e, v) LIMIT 3": "gap(e, v) AS gap",
+    "ORDER BY v.speed DESC LIMIT 4": "v.speed AS speed",
+    "SAMPLE 2 PER v": "v.kind AS kind",
+}
+
+
+@pytest.mark.parametrize("end", CHOSEN)
+def test_the_gallery_keeps_the_order_of_the_query(page: Any, town_store: Path, end: str) -> None:
+    rows = Store(town_store).find(f"{NEAR} {end}").rows()
+    search(page, f"{NEAR} RETURN {CHOSEN[end]} {end}")
+    expect(page.locator(".group")).to_contain_text("as the query orders them")
+    expect(page.locator(".tile")).to_have_count(len(rows))
+    times = page.locator(".tile .about button:first-of-type").all_inner_texts()
+    assert times == [f"{row.t:.1f} s" for row in rows]
+    name = CHOSEN[end].split(" AS ")[1]
+    for tile, row in zip(page.locator(".tile .who").all_inner_texts(), rows, strict=True):
+        assert tile.startswith(row.v_name)
+        assert f", {name} " in tile
+    page.locator(".tile").first.click()
+    expect(page.locator(".transport .time")).to_contain_text(f"town#{rows[0].seq} ")
+    order = page.get_by_label("order")
+    expect(order.locator("option").first).to_have_text("as the query orders them")
+    page.get_by_role("button", name="table", exact=True).click()
+    expect(page.locator("tbody tr")).to_have_count(len(rows))
+    page.get_by_role("button", name="pictures", exact=True).click()
+    expect(page.locator(".tile")).to_have_count(len(rows))
+
+
+def test_values_of_several_matches_are_a_table(page: Any, town_store: Path) -> None:
+    text = f"{NEAR} RETURN v.kind AS kind, MIN(gap(e, v)) AS least ORDER BY least"
+    search(page, text)
+    rows = Store(town_store).find(text).rows()
+    expect(page.locator(".status .note")).to_contain_text(
+        "Without RETURN, the matches are pictures"
+    )
+    expect(page.locator("tbody td:first-child")).to_have_text([row.kind for row in rows])
+    page.get_by_role("button", name="Compare").click()
+    page.get_by_label("Query of B").fill(NEAR)
+    page.get_by_label("Query of B").press("Enter")
+    expect(page.get_by_role("alert")).to_contain_text("values of several matches")
+    page.get_by_label("Query of B").fill("")
+    page.get_by_label("Query of B").press("Enter")
+
+
+def test_values_of_each_match_are_in_a_table_beside_the_pictures(
+    page: Any, town_store: Path
+) -> None:
+    text = f"{NEAR} RETURN gap(e, v) AS gap"
+    search(page, text)
+    expect(page.locator(".status .note")).to_contain_text("the table has the values of RETURN")
+    expect(page.locator(".tile").first).to_be_visible()
+    page.get_by_role("button", name="table", exact=True).click()
+    expect(page.locator("tbody tr")).to_have_count(len(Store(town_store).find(text)))
+
+
+def test_a_gap_of_the_matrix_names_both_features(page: Any) -> None:
+    page.get_by_role("button", name="Coverage").click()
+    page.get_by_role("button", name="Matrix of gaps").click()
+    cells = page.locator(".gap-cell")
+    cells.first.wait_for()
+    names = [re.sub(": in no frame$", "", one.get_attribute("aria-label")) for one in cells.all()]
+    place, (one, other) = next(
+        (place, pair)
+        for place, pair in enumerate(name.split(" with ") for name in names)
+        if all(len(feature.split()) == 3 for feature in pair)
+    )
+    cells.nth(place).focus()
+    cells.nth(place).press("Enter")
+    told = page.locator(".nearest")
+    expect(told).to_contain_text("No frame of the store has")
+    for relation in (one.split()[1], other.split()[1]):
+        expect(told).to_contain_text(f"[:{relation}")
+    expect(told).to_contain_text("together with")
+    expect(told.get_by_role("button")).to_have_text(re.compile(r"town#\d+"))
+
+
+def test_without_a_match_the_page_tells_the_part_and_the_nearest_frame(
+    page: Any, town_store: Path
+) -> None:
+    release = hold(page, "**/api/nearest")
+    text = "MATCH (e:Ego) WHERE e.speed > 3 AND e.speed < 2.5"
+    search(page, text)
+    expect(page.locator(".sheet")).to_contain_text("looking for the part that is never true")
+    release()
+    near = Store(town_store).find(text).nearest()
+    told = page.locator(".nearest")
+    expect(told).to_contain_text("has e.speed < 2.5 together with (e:Ego) and e.speed > 3.")
+    expect(told).to_contain_text(f"The nearest is {near['found']}: town#{near['seq']}")
+    assert page.get_by_text("o frame of the store has").count() == 1  # said once
+    search(page, "MATCH (e:Ego) WHERE e.speed < 3 THEN WITHIN 1ms MATCH (e) WHERE e.speed > 4")
+    expect(told).to_contain_text("Each part of the pattern is true in some frame")
+
+
+def test_a_search_in_words_shows_that_it_runs(page: Any) -> None:
+    search(page, f"{NEAR} WHERE e.speed > 3")
+    page.locator(".cm-content").press("End")
+    expect(page.get_by_label("Number under the cursor")).to_be_visible()
+    expect(page.get_by_label("order")).to_be_visible()
+    release = hold(page, "**/api/search*")
+    field = page.get_by_label("Search the library")
+    field.fill("pedestrian crosses")
+    expect(page.locator(".sheet")).to_contain_text(re.compile(r"searching … \d+ s"))
+    # Nothing of the query before is shown: its numbers would be taken for those of the words.
+    for gone in (".status", ".slider", ".tile", ".card"):
+        expect(page.locator(gone)).to_have_count(0)
+    release()
+    expect(page.locator(".near-cards .card").first).to_contain_text("crossing")
+    expect(page.get_by_text("searching …")).to_have_count(0)
+    release = hold(page, "**/api/search*")
+    field.fill("brakes hard")
+    expect(page.locator(".near-cards")).to_have_count(0)  # cards of other words
+    release()
+    expect(page.locator(".near-cards .card").first).to_contain_text("brak")
+    page.route("**/api/search*", lambda route: route.fulfill(status=500, body="no"))
+    field.fill("cut in")
+    expect(page.get_by_role("alert")).to_contain_text("the server answered 500")
+    page.unroute_all()
+    field.fill("")
+    expect(page.locator(".status")).to_be_visible()
+
+
+PLACES: Final = """() => [...document.querySelectorAll(".card")].map(one => {
+  const {x, y, width, height} = one.getBoundingClientRect();
+  return [one.querySelector("h3").firstChild.textContent, x, y, width, height].join(" ");
+})"""
+
+
+def test_cards_stay_where_they_are_while_counts_arrive(page: Any) -> None:
+    release = hold(page, "**/api/find")
+    page.reload()
+    page.locator(".card").nth(50).wait_for()
+    page.mouse.move(2, 2)
+    before = page.evaluate(PLACES)
+    assert page.locator(".card .badge").count() == 0
+    release()
+    page.locator(".card .badge").nth(4).wait_for()
+    assert page.evaluate(PLACES) == before
+    first = page.get_by_role("button", name="those with matches first")
+    first.click()
+    expect(first).to_have_attribute("aria-pressed", "true")
+    assert sorted(page.evaluate(PLACES)) != sorted(before)
+    first.click()
+    assert page.evaluate(PLACES) == before
+
+
+def test_patterns_of_one_name_are_told_apart(page: Any) -> None:
+    page.get_by_label("Search the library").fill("cut in")
+    heads = page.locator(".near-cards .card h3")
+    expect(heads.filter(has_text=re.compile("cut ?in", re.IGNORECASE)).nth(1)).to_be_visible()
+    names = (one.inner_text().lower() for one in heads.all())
+    shown = ["".join(re.findall("[a-z]", name.replace("check", ""))) for name in names]
+    assert {"cutinconcepts", "cutinleaderboard"} <= {*shown}
+    assert len({*shown}) == len(shown)
+    page.get_by_label("Search the library").fill("")
+
+
+def test_words_of_the_library_are_shown_as_written(page: Any) -> None:
+    define = "DEFINE passes(a, c) AS a.speed > 3 AND dist(a, c) < 40;"
+    query = f"{define} MATCH (e:Ego), (v:Vehicle) WHERE passes(e, v) AND NOT stopped(v)"
+    search(page, query)
+    open_first(page)
+    lanes = page.locator(".timeline .lane[data-holds] .label")
+    expect(lanes).to_have_text([re.compile(r"^✓.passes\(e, v\)$"), "✓NOT stopped(v)"])
+    written = page.locator(".conditions > li > details > summary")
+    expect(written).to_have_text(["✓ passes(e, v)", "✓ NOT stopped(v)"])
+    inside = page.locator(".conditions details li")
+    expect(inside.first).to_be_hidden()
+    written.first.click()
+    expect(inside.nth(0)).to_have_text("✓ e.speed > 3")
+    expect(inside.nth(1)).to_have_text("✓ dist(e, v) < 40")
+    page.get_by_role("button", name="Parts of passes(e, v)").click()
+    texts = ["✓e.speed > 3", "✓dist(e, v) < 40"]
+    expect(lanes).to_have_text([re.compile("passes"), *texts, "✓NOT stopped(v)"])
+
+
+def boxes_of(page: Any) -> list[tuple[float, float, float, float]]:
+    """The boxes of nodes, and of the names of relations, in the panel of neighbours."""
+    return page.locator("svg[aria-label=Neighbours]").evaluate(
+        """svg => [...svg.querySelectorAll("rect, text.halo")].map(one => {
+          const {x, y, width, height} = one.getBBox();
+          return [x, y, width, height];
+        })"""
+    )
+
+
+def test_names_of_neighbours_do_not_overlap(page: Any) -> None:
+    search(page, "MATCH (e:Ego)-[:near]->(v:Vehicle), (e)-[:near]->(w:Vehicle)")
+    open_first(page)
+    page.get_by_role("tab", name="neighbours").click()
+    for width, height in ((1440, 900), (1100, 620), (390, 844)):
+        page.set_viewport_size({"width": width, "height": height})
+        for _ in range(3):
+            page.locator("svg[aria-label=Neighbours] rect").nth(2).wait_for()
+            boxes = boxes_of(page)
+            for at, (x, y, wide, high) in enumerate(boxes):
+                for left, top, w, h in boxes[:at]:
+                    apart = x >= left + w or left >= x + wide or y >= top + h or top >= y + high
+                    assert apart, (x, y, left, top)
+            was = page.locator(".transport .time").inner_text()
+            page.locator(".scene").press(".")
+            expect(page.locator(".transport .time")).not_to_have_text(was)
+    page.set_viewport_size({"width": 1440, "height": 900})
+
+
+def test_an_error_is_shown_once(page: Any) -> None:
+    search(page, "MATCH (e:Ego)-[:near_kol]->(v)")
+    reason = page.locator(".status .error b").inner_text()
+    assert reason.startswith("line 1, column 17: ")
+    assert page.get_by_text(reason.split(": ", 1)[1]).count() == 1
+    assert page.get_by_text("did you mean").count() == 1
+    page.route("**/api/find", lambda route: route.abort())
+    page.route("**/api/stamp", lambda route: route.abort())
+    page.locator(".cm-content").press("Control+Enter")
+    expect(page.get_by_role("alert")).to_contain_text("The server does not answer")
+    expect(page.locator(".status .error")).to_have_text("not answered yet")
+    assert page.get_by_text("The server does not answer").count() == 1
