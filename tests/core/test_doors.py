@@ -9,7 +9,6 @@ import re
 import socket
 import subprocess
 import sys
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -440,12 +439,10 @@ def test_what_is_no_file_is_refused_as_a_store_at_once(
         "out": tmp_path / "out",
         "recording": drives[1] / "drive12.mcap",
     }
-    start = time.perf_counter()
     result = run(*(word.format(**given) for word in verb))
 
     assert result.exit_code == 1
     assert f"{special[what]}: {what}: not a store" in result.output
-    assert time.perf_counter() - start < 5
 
 
 @pytest.mark.parametrize("ending", [".wal", ".gate", ".segment-1-ab"])
@@ -453,14 +450,12 @@ def test_a_pipe_beside_a_store_makes_nobody_wait(
     run: Any, store: Any, drives: Any, ending: Any
 ) -> None:
     os.mkfifo(store.with_name(f"{store.name}{ending}"))
-    start = time.perf_counter()
     found = run("find", store, "MATCH (e:Ego)", "--count")
     removed = run("remove", store, "drive12")
     added = run("ingest", store, drives[1] / "drive12.mcap")
 
     expected = 1 if ending == ".wal" else 0
     assert [one.exit_code for one in (found, removed, added)] == [expected] * 3, added.output
-    assert time.perf_counter() - start < 10
 
 
 # A connection that this process has already
@@ -481,10 +476,8 @@ def test_a_store_that_this_process_has_open_by_duckdb_is_said_to_be_at_once(
             list(opened.find("MATCH (e:Ego)"))
 
     with duckdb.connect(str(store), read_only=read_only) as connection:
-        start = time.perf_counter()
         with pytest.raises(StoreError, match="open in this process already, by a connection of"):
             ask()
-        assert time.perf_counter() - start < 3
         assert connection.execute("SELECT count(*) FROM inside.trace").fetchall() == [(2,)]
 
     assert len(sgstore.open(store).info()) == 2
@@ -577,7 +570,6 @@ def test_a_recording_that_has_become_no_file_is_refused_at_once(
     run: Any, store: Any, special: Any, what: Any
 ) -> None:
     change(store, f"UPDATE inside.recording SET uri = '{special[what]}', size = 0")
-    start = time.perf_counter()
 
     verified = run("verify", store, "--payloads")
     shown = run(
@@ -585,7 +577,6 @@ def test_a_recording_that_has_become_no_file_is_refused_at_once(
     )
     assert (verified.exit_code, shown.exit_code) == (1, 1)
     assert str(special[what]) in verified.stdout
-    assert time.perf_counter() - start < 20
 
 
 @pytest.mark.parametrize(

@@ -184,7 +184,7 @@ def children(pid: int) -> set[int]:
 def test_workers_end_with_the_run_that_is_killed(tmp_path: Path) -> None:
     paths = [drive(tmp_path / f"d{i}.mcap", frames=400 + i) for i in range(4)]
     run = begun(tmp_path / "s.db", paths, jobs=2)
-    end = time.monotonic() + 30
+    end = time.monotonic() + 300
     while len(workers := children(run.pid)) < 2 and time.monotonic() < end:
         time.sleep(0.02)
     run.kill()
@@ -204,12 +204,12 @@ def test_ctrl_c_leaves_a_whole_store_and_nothing_beside_it(tmp_path: Path, jobs:
     store.parent.mkdir()
     command = [sys.executable, "-m", "sgstore", "ingest", store, *paths, "--jobs", str(jobs)]
     run = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
-    end = time.monotonic() + 60
+    end = time.monotonic() + 300
     while not store.exists() and time.monotonic() < end:
         time.sleep(0.02)
     time.sleep(0.2)
     run.send_signal(signal.SIGINT)
-    _, errors = run.communicate(timeout=30)
+    _, errors = run.communicate(timeout=300)
 
     assert run.returncode == 130, errors
     assert "interrupted; the store has all finished work" in errors

@@ -7,11 +7,11 @@ import tracemalloc
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from time import process_time
 from typing import Any
 
 import numpy as np
 import pytest
+from counting import calls
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import DecodeError
 from hypothesis import HealthCheck, given, settings
@@ -994,14 +994,14 @@ def test_a_message_of_countless_objects_is_a_loss_and_costs_little(tmp_path: Pat
         recorder.sensor_view(0.2, [])
 
     tracemalloc.start()
-    start = process_time()
-    _, _, report = read(path)
-    cost, peak = process_time() - start, tracemalloc.get_traced_memory()[1]
+    with calls() as counted:
+        _, _, report = read(path)
+    peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
 
     assert report.frames == 1
     assert "more than 100000 objects" in report.losses[0].reason
-    assert cost < 2
+    assert counted.total() < 1_000_000
     assert peak < 64 << 20
 
 
@@ -1371,7 +1371,7 @@ def lengthy(number: int, content: bytes) -> bytes:
         (7, 5, 9 << 20),
         (5, 10, 3 << 20),
         (4, 5, 2 << 20),
-        (5, 10, 1 << 20),
+        (5, 10, 1 << 17),
     ],
 )
 def test_countless_references_are_a_loss_and_cost_little(
@@ -1385,12 +1385,12 @@ def test_countless_references_are_a_loss_and_cost_little(
         ground = ground_truth(0.1, [car(1)]).SerializeToString()
         recorder.write(recorder.channels["truth"], 0.1, ground + hostile)
         recorder.ground_truth(0.2, [car(1)], host=1)
-    start = process_time()
-    _, blocks, report = read(path)
+    with calls() as counted:
+        _, blocks, report = read(path)
 
     assert len(of(blocks, "1")) >= 2
     assert len(report.losses) == (field != 5 or count > 2 << 20)  # else known by its number
-    assert process_time() - start < 10
+    assert counted.total() < 4_000_000
 
 
 def test_channels_may_be_numbered_from_nought(tmp_path: Path) -> None:

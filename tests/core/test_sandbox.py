@@ -34,7 +34,7 @@ def box(path: Path) -> Iterator[Sandbox]:
     """With a table of the host's, which opens a folder to the process."""
     table = path.with_name("labels.csv")
     Store(path).sql("SELECT frame_id, seq % 3 AS score FROM frames").csv(table)
-    with Sandbox(path, timeout_s=20, tables={"labels": table}) as box:
+    with Sandbox(path, timeout_s=600, tables={"labels": table}) as box:
         assert box.sql("SELECT count(*) FROM labels").rows == [(750,)]
         yield box
 

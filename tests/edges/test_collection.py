@@ -6,13 +6,13 @@ import json
 import random
 import shutil
 import sys
-import time
 from collections import Counter
 from dataclasses import fields, replace
 from types import ModuleType, SimpleNamespace
 from typing import TYPE_CHECKING, Any, get_args
 
 import pytest
+from counting import calls
 from oracle_collection import compare, renamed, texts, worlds
 from oracle_worlds import random_world
 from thorough import LONG, some
@@ -401,22 +401,19 @@ def many_bundles(count: int) -> catalogue.Snapshot:
     return catalogue.Snapshot(1, facts)
 
 
-def decided(whole: Collection, compiled: Compiled, limit: float) -> list[str]:
-    """The bundles that may answer, told within a limit of processor time; s."""
-    began = time.process_time()
-    found = whole.may_answer(compiled)
-    assert time.process_time() - began < limit
+def decided(whole: Collection, compiled: Compiled) -> list[str]:
+    """The bundles that may answer, told within few calls for each bundle."""
+    with calls() as counted:
+        found = whole.may_answer(compiled)
+    assert counted.total() < 100 * len(whole.bundles())
     return found
 
 
-def test_ten_thousand_bundles_are_decided_in_half_a_second(place: Path) -> None:
+def test_thousands_of_bundles_are_decided_in_few_calls(place: Path) -> None:
     whole = Collection(place)
-    began = time.process_time()
-    whole.snapshot = many_bundles(10_000)
-    # Processor time grows on a busy machine: a longer limit only if making the bundles took longer, too.
-    limit = max(0.5, 1.5 * (time.process_time() - began))
+    whole.snapshot = many_bundles(2_000)
     rare = compile_query("MATCH (a:Car)-[:opposes]->(b:Truck)", whole.catalog, {})
-    assert len(decided(whole, rare, limit)) == 100
+    assert len(decided(whole, rare)) == 20
 
     def holding(*triples: tuple[str, str, str]) -> set[str]:
         held = {b: {r[3:6] for r in whole.snapshot.of("triple", b)} for b in whole.bundles()}
@@ -438,11 +435,11 @@ def test_ten_thousand_bundles_are_decided_in_half_a_second(place: Path) -> None:
         ),
         ("MATCH (a:Car)-[:near]->(b:Truck) WHERE HAPPENS collision(a, b)", (near,)),
     ):  # each bundle has other triples
-        found = decided(whole, compile_query(text, whole.catalog, {}), limit)
+        found = decided(whole, compile_query(text, whole.catalog, {}))
         assert set(found) == holding(*triples), text
     every = compile_query("MATCH (a)-[:near|visible|opposes]->(b)-[:near]-()", whole.catalog, {})
     assert (
-        len(decided(whole, every, limit)) == 10_000
+        len(decided(whole, every)) == 2_000
     )  # all that they hold matters, and each holds other things
 
 

@@ -267,7 +267,7 @@ def test_of_two_commits_at_once_none_is_lost(
         """Both have looked before one of them writes."""
         if name.startswith("catalogue/") and threading.get_ident() not in waited:
             waited.add(threading.get_ident())
-            together.wait(20)
+            together.wait(300)
         return write(self, name, data)
 
     monkeypatch.setattr(places._Remote, "write_new", at_once)

@@ -94,7 +94,7 @@ def visit(browser: Any, context: Any) -> Iterator[Callable[..., Any]]:
             contexts.append(browser.new_context(viewport=SIZE, **how))
         page = (contexts[-1] if how else context).new_page()
         pages.append(page)
-        page.set_default_timeout(60_000)
+        page.set_default_timeout(180_000)
 
         def on_console(told: Any) -> None:
             if told.type in {"error", "warning"}:

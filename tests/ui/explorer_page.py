@@ -13,7 +13,7 @@ sync = pytest.importorskip("playwright.sync_api", reason="Playwright is not inst
 pytest.importorskip("uvicorn", reason="the extra [ui] is not installed")
 
 expect = sync.expect
-expect.set_options(timeout=60_000)
+expect.set_options(timeout=180_000)
 
 NEAR: Final = "MATCH (e:Ego)-[:near_coll]->(v:Vehicle)"
 PICTURES = os.environ.get("SGSTORE_SCREENSHOTS")

@@ -11,11 +11,9 @@ import re
 import shutil
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import httpx
 import pytest
 from explorer_page import (
     AXE,
@@ -40,24 +38,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 pytestmark = pytest.mark.seconds(60)
-
-
-def test_an_answer_does_not_wait_for_the_one_before_it(
-    served: Callable[[Path], str], town_store: Path
-) -> None:
-    """Small packets that are held back until others are confirmed take 40 ms each."""
-
-    def fastest(client: httpx.Client, headers: dict[str, str]) -> float:
-        took: list[float] = []
-        for _ in range(15):
-            begun = time.perf_counter()
-            client.get("/api/nothing", headers=headers)
-            took.append(time.perf_counter() - begun)
-        return min(took[1:])
-
-    with httpx.Client(base_url=served(town_store)) as client:
-        alone = fastest(client, {"Connection": "close"})
-        assert fastest(client, {}) < 5 * alone
 
 
 def test_the_library_is_there_before_anything_is_typed(page: Any, town_store: Path) -> None:

@@ -87,7 +87,7 @@ def page(browser: Any, served: Served) -> Iterator[Any]:
     context = browser.new_context(viewport={"width": 1280, "height": 800})
     context.grant_permissions(["clipboard-read", "clipboard-write"])
     page = context.new_page()
-    page.set_default_timeout(25_000)
+    page.set_default_timeout(180_000)
     page.goto(served.address)
     yield page
     context.close()

@@ -33,5 +33,5 @@ def process(code: str, **values: object) -> Generator[subprocess.Popen[str]]:
         if not child.stdout.readline():
             raise AssertionError(child.stderr.read())
         yield child
-        _, errors = child.communicate(timeout=60)
+        _, errors = child.communicate(timeout=300)
         assert child.returncode == 0, errors
