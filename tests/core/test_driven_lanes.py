@@ -402,7 +402,6 @@ def test_results_of_driven_lanes_stay_in_a_turned_and_mirrored_world(way: str) -
 
 
 @pytest.mark.data
-@pytest.mark.long
 @pytest.mark.parametrize(
     "name",
     [
@@ -410,14 +409,14 @@ def test_results_of_driven_lanes_stay_in_a_turned_and_mirrored_world(way: str) -
         "sumo/Town10HD_sumo_osi",
     ],
 )
-@pytest.mark.seconds(20)
+@pytest.mark.parametrize("until", [5.0, pytest.param(None, marks=pytest.mark.long)])
 def test_a_monitor_never_contradicts_a_store_of_a_recording(
-    data: Path, tmp_path: Path, name: str
+    data: Path, tmp_path: Path, name: str, until: float | None
 ) -> None:
-    drive = Drive.of(data / "traces" / f"{name}.mcap", tmp_path)
+    drive = Drive.of(data / "traces" / f"{name}.mcap", tmp_path, until)
     found = drive.compare_lanes(LANE_RULES)
 
-    assert found["false", "false"] > 5
+    assert found["false", "false"] > (2 if until else 5)
 
 
 @pytest.mark.data

@@ -12,6 +12,7 @@ import sys
 import tempfile
 from collections import Counter
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -156,15 +157,16 @@ class Drive:
     """What was watched already."""
 
     @classmethod
-    def of(cls, recording: Path, folder: Path) -> Drive:
+    def of(cls, recording: Path, folder: Path, until: float | None = None) -> Drive:
+        """Ingest a recording, or its first seconds, and make its graphs step by step."""
         path = folder / f"{recording.stem}.sgstore"
         if not path.exists():
-            ingest(path, [recording])
+            ingest(path, [recording], until=until)
         store = Store(path)
-        ((name,),) = store.sql("SELECT name FROM inside.trace").values
+        ((name, count),) = store.sql("SELECT trace, count(*) FROM frames GROUP BY trace").values
         with opened(str(recording), Config()) as source:
             generator = SceneGraphGenerator(source.road_map, Config())
-            graphs = [generator.step(frame) for frame in source.frames]
+            graphs = [generator.step(frame) for frame in islice(source.frames, count)]
         stored = dict(store.sql("SELECT node_id, ident FROM entities").values)
         nodes = (node for graph in graphs for node in graph.known().nodes.items())
         online = {node: about["ident"] for node, about in nodes if "ident" in about}
