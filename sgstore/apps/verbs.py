@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import re
 import sys
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.errors import ConfigError, ExportError, one_store_needed
-from sgstore.lang.library import statement
+from sgstore.lang.library import pattern_named, statement
 from sgstore.model.world import Clip
 from sgstore.query import Store
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 
     from sgstore.collection import Collection
     from sgstore.draw import Timeline
@@ -223,42 +224,70 @@ def coverage(  # noqa: PLR0913 - the options of the command
     chosen = chosen_frames(store, "" if kind == "spec" else query, parameters)
     other = [] if by is None else [frames_at(by)]
     declared = None if slots is None else of.Specification.read(slots)
-    listed = 2 if missing else 1 if covered else 0
+    asked = {"missing": missing, "covered": covered}
     if declared is not None and kind in {"spec", "combos"}:
-        return of.slot_coverage(chosen, declared, how["k"] if kind == "combos" else 0)[listed]
+        return listed(of.slot_coverage(chosen, declared, how["k"] * (kind == "combos")), **asked)
     if kind == "spec":
-        return of.specification(chosen, query, how["cells"], *other)[listed]
+        return listed(of.specification(chosen, query, how["cells"], *other), **asked)
     if kind == "sequences":
         named, within = of.manoeuvres_named(how["manoeuvres"]), seconds(how["within"], "--within")
         found = of.sequences(chosen, how["k"], other[0] if other else None, named, within)
-        return (found.shares, found.covered, found.missing)[listed]
+        return listed(found, **asked)
     options = how["abstraction"], how["window"], how["incomplete"]
     both = [
         of.classed(one, *options, declared[0] if declared else None) for one in (chosen, *other)
     ]
     if kind == "combos":
         pairs = of.combos(both[0], options[0], how["k"], *both[1:], of_ego=how["of_ego"])
-        return (pairs.shares, pairs.covered(), pairs.missing)[listed]
-    return _of_classes(kind, both, **how)
+        return listed(pairs, **asked)
+    options = {name: how[name] for name in ("items", "unit", "points", "by_frame", "depth")}
+    tables = class_tables(kind, both, abstraction=how["abstraction"], **options)
+    return tables[-1 if how["tree"] else 0]
 
 
-def _of_classes(kind: str, both: list[Classed], **how: Any) -> ReportTable:
-    """Return a coverage table of one or two selections of frames."""
+def listed(found: Any, *, missing: bool, covered: bool) -> ReportTable:
+    """Return the missing or the covered items of a coverage, or by default its shares.
+
+    ``found``: the three tables shares, covered, missing; or an object with these attributes.
+    """
+    name = "missing" if missing else "covered" if covered else "shares"
+    tables = ("shares", "covered", "missing")
+    return found[tables.index(name)] if isinstance(found, tuple) else getattr(found, name)
+
+
+def class_tables(  # noqa: PLR0913 - the options of the commands
+    kind: str,
+    classed: Sequence[Classed],
+    *,
+    items: str = "classes",
+    unit: Any = "frame",
+    points: int = 40,
+    abstraction: str = "RSV",
+    by_frame: bool = False,
+    depth: int = 4,
+) -> tuple[ReportTable, ...]:
+    """Return the tables of a coverage of classes: one, or for ``explain`` features and a tree.
+
+    Parameters
+    ----------
+    kind : str
+        ``classes``, ``growth``, ``of``, ``novel``, ``venn`` or ``explain``.
+    classed : sequence of Classed
+        Frames with their classes: one selection, or the two to compare.
+    items, unit, points, abstraction, by_frame, depth
+        As in :meth:`sgstore.query.StoreVerbs.coverage`.
+    """
     from sgstore.testsets import coverage as of
 
-    items = {"classes": of.novel, "frames": of.novel_frames, "clips": of.novel_clips}
-    novel = items[one_of("--items", how["items"], items)]
-    if kind in {"classes", "growth"}:
-        unit = how["unit"]
-        return (
-            of.classes(both[0], unit)
-            if kind == "classes"
-            else of.growth(both[0], unit, how["points"])
-        )
+    novel = {"classes": of.novel, "frames": of.novel_frames, "clips": of.novel_clips}
+    chosen = novel[one_of("--items", items, novel)]
+    if kind == "classes":
+        return (of.classes(classed[0], unit),)
+    if kind == "growth":
+        return (of.growth(classed[0], unit, points),)
     if kind == "explain":
-        about = {"by_frame": how["by_frame"], "depth": how["depth"]}
-        return of.explain(both[0], both[1], how["abstraction"], **about)[how["tree"]]
-    return {"of": of.covered, "venn": of.venn, "novel": novel}[kind](*both)
+        return of.explain(*classed, abstraction, by_frame=by_frame, depth=depth)
+    return ({"of": of.covered, "venn": of.venn, "novel": chosen}[kind](*classed),)
 
 
 _COMPARING: Final = ("of", "novel", "venn", "explain")
@@ -315,14 +344,61 @@ def timeline(
     """Return lanes of matches and violations; see :meth:`sgstore.query.StoreVerbs.timeline`."""
     from sgstore.draw import draw_timelines, timelines
 
-    asked: dict[str, Any] = {}
-    for number, query in enumerate(queries, start=1):
-        short = query if query.isidentifier() else f"match {number}"
-        asked[short] = statement(query, parameters or {}, check=True)
-    found = timelines(one_store(store), asked, traces)
+    found = timelines(one_store(store), by_lane(queries, parameters or {}), traces)
     if to is not None:
         draw_timelines(found, Path(to))
     return found
+
+
+def by_lane(
+    queries: Sequence[str], parameters: Mapping[str, Any], files: Mapping[str, str] | None = None
+) -> dict[str, tuple[str, Mapping[str, object]]]:
+    """Return the queries of a timeline by the names of their lanes, with the values of their parameters.
+
+    Parameters
+    ----------
+    queries : sequence of str
+        Each is a statement, or the name of a pattern in the library.
+    parameters : mapping
+        Patterns of the library take the values of their own parameters; all others belong to the statements.
+    files : mapping of str to str, optional
+        More statements, by the name of their lane.
+
+    Raises
+    ------
+    QueryError
+        A name is unknown, or no statement has a parameter.
+    """
+    asked = list(dict.fromkeys(one.strip() for one in queries))
+    named = {one: pattern_named(one) for one in asked if one.isidentifier()}
+    rest = {
+        name: value
+        for name, value in parameters.items()
+        if not any(name in one.parameters for one in named.values())
+    }
+    texts = [one for one in asked if one not in named]
+    if rest and named and not (texts or files):
+        next(iter(named.values())).written(**rest)  # raises an error with the known parameters
+    found: dict[str, tuple[str, Mapping[str, object]]] = {}
+    for one in asked:
+        if one in named:
+            lane = free_name(named[one].name, f"pattern {one}", found)
+            own = {k: value for k, value in parameters.items() if k in named[one].parameters}
+        else:
+            lane = "match" if len(texts) == 1 else f"match {texts.index(one) + 1}"
+            own = rest
+        found[lane] = statement(one, own, check=True)
+    for name, text in (files or {}).items():
+        found[free_name(name, f"file {name}", found)] = statement(text, rest, check=True)
+    return found
+
+
+def free_name(name: str, longer: str, taken: Container[str]) -> str:
+    """Return a name that is not taken: the name, a longer one, or that with a number."""
+    if name not in taken:
+        return name
+    numbered = (f"{longer} ({number})" for number in count(2))
+    return next(one for one in chain([longer], numbered) if one not in taken)
 
 
 def report(

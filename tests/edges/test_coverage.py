@@ -351,7 +351,7 @@ def test_combinations_are_those_of_brute_force_and_their_queries_find_as_many_fr
         " & ".join(" ".join(name) for name in some) for some, n in wanted.items() if n == 0
     }
     assert all(store.find(query).count() == 0 for query in missing.column("query")[:8])
-    listed = combined.covered()
+    listed = combined.covered
     assert listed.column("frames") == sorted((n for n in wanted.values() if n), reverse=True)
     of_theirs = {some for one_set in theirs for some in combinations(sorted(one_set), k)}
     of_ours = {some for one_set in sets for some in combinations(sorted(one_set), k)}
@@ -370,7 +370,7 @@ def test_only_features_of_the_ego_count_where_that_is_asked(town: str) -> None:
     assert set(own.found.features.names) == wanted
     assert 0 < len(wanted) < len(whole.found.features.names)
     store = sgstore.open(town)
-    for row in own.covered().rows[:6]:
+    for row in own.covered.rows[:6]:
         a, relation, b = (part for part in row[0].split(" "))
         ends = [
             f"(:{'Ego' if x == 'ego' else x.replace('_', '').capitalize() + '&!Ego'})"

@@ -339,7 +339,7 @@ def test_pairs_of_features_are_those_that_coverage_counts(store: Store) -> None:
     kept = combos(classed(ChosenFrames("kept", store, ids), "E"), "E", 2)
 
     assert found.holdings is not None
-    assert found.holdings.total == len(known.covered().rows) == len(kept.covered().rows)
+    assert found.holdings.total == len(known.covered.rows) == len(kept.covered.rows)
     assert found.result["kept"] == found.holdings.total
 
 

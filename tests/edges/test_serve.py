@@ -607,7 +607,7 @@ def test_matrix_of_gaps_is_that_of_the_features(page: Page, store: Store) -> Non
 
     matrix = page.post("/api/coverage", what="matrix").json()
     names, frames = matrix["names"], matrix["frames"]
-    table = combos(classed(ChosenFrames("town.sgstore", store), "RSV"), "RSV", 2).covered()
+    table = combos(classed(ChosenFrames("town.sgstore", store), "RSV"), "RSV", 2).covered
     known = dict(zip(table.column("combination"), table.column("frames"), strict=True))
 
     for i, j in itertools.combinations(range(len(names)), 2):

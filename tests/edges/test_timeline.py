@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from sgstore.apps.assistant import StoreTools
 from sgstore.apps.cli import run
 from sgstore.apps.demo import RECORDING
 from sgstore.draw import Lane, Timeline, draw_timelines, lines_of, parts_timeline, timelines
+from sgstore.errors import QueryError
 from sgstore.query import Store
 
 if TYPE_CHECKING:
@@ -158,3 +160,27 @@ def test_a_recording_is_watched_by_the_verb(capsys: pytest.CaptureFixture[str]) 
     assert run([*asked, "--json"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert '"event": "verdict", "name": "slow"' in lines[-1]
+
+
+def test_faces_name_lanes_alike(town: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    asked = ["cut_in", "MATCH (e:Ego) WHERE e.speed > 8", CLOSE]
+    lanes = {"cut_in", "match 1", "apart"}
+
+    (found,) = Store(town).timeline(*asked)
+    assert {lane.name for lane in found.lanes} == lanes
+    with StoreTools(town, timeout_s=60) as tools:
+        (told,) = tools.timeline(asked).data["timelines"]
+    assert {lane["name"] for lane in told["lanes"]} == lanes
+    assert run(["timeline", str(town), *asked]) == 0
+    shown = re.findall(r"^  ([\w ]+?)(?: ·|  )", capsys.readouterr().out, re.MULTILINE)
+    assert {*shown} == lanes
+
+
+def test_parameters_belong_to_the_lane_that_has_them(town: Path) -> None:
+    store, text = Store(town), "MATCH (e:Ego) WHERE e.speed > $least"
+    values = {"within": 3, "least": 8}
+    both = store.timeline("cut_in", text, parameters=values)[0].lanes
+
+    assert {lane.name for lane in both} == {"cut_in", "match"}
+    with pytest.raises(QueryError, match="nothing"):
+        store.timeline("cut_in", parameters={"nothing": 1})

@@ -316,7 +316,7 @@ class StoreTools:
     def timeline(
         self,
         queries: Annotated[list[str], Field(min_length=1)],
-        traces: Traces = None,
+        traces: list[str] | None = None,
         picture: bool = False,
     ) -> ToolAnswer:
         """Plot matches and rule violations over time, one lane per entity, for each trace that has any.

@@ -13,6 +13,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.apps.sandbox import plain, serve
+from sgstore.apps.verbs import by_lane
 from sgstore.errors import QueryError
 from sgstore.lang.help import words
 from sgstore.lang.library import pattern_named
@@ -178,16 +179,8 @@ def _clips(
 def _timeline(store: Store, limit: int, queries: Sequence[str], traces: Sequence[str]) -> Reply:
     from sgstore.draw import timelines
 
-    asked: dict[str, tuple[str, Mapping[str, Any]]] = {}
-    for number, text in enumerate(queries, start=1):
-        name = text.strip()
-        if name.isidentifier():
-            found = pattern_named(name)
-            asked[found.name] = _named(name, {}, check=found.is_check)
-        else:
-            asked["match" if len(queries) == 1 else f"match {number}"] = text, {}
     only = [store.file.trace(name).name for name in traces]
-    found = [asdict(one) for one in timelines(store, asked, only)]
+    found = [asdict(one) for one in timelines(store, by_lane(queries, {}), only)]
     return {"timelines": found[:limit], "truncated": len(found) > limit}
 
 

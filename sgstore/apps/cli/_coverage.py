@@ -117,10 +117,11 @@ def classes_(
     ask: FrameAskOptions,
 ) -> None:
     """List the classes of scenes by frequency, and estimate the unseen classes."""
-    from sgstore.testsets.coverage import classes, rank_sizes
+    from sgstore.apps.verbs import class_tables
+    from sgstore.testsets.coverage import rank_sizes
 
     (frames,) = scenes.of(ask, a, slots=scenes.slots)
-    _report_scenes(classes(frames, unit), frames, ask, limit)
+    _report_scenes(class_tables("classes", [frames], unit=unit)[0], frames, ask, limit)
     if picture is not None:
         from sgstore.draw import draw_rank_sizes
 
@@ -140,9 +141,9 @@ def of_(
     ask: FrameAskOptions,
 ) -> None:
     """Measure how much of the frames of A is covered by B, by classes and by frames."""
-    from sgstore.testsets.coverage import covered
+    from sgstore.apps.verbs import class_tables
 
-    ask.report(covered(*scenes.of(ask, a, by, slots=scenes.slots)))
+    ask.report(*class_tables("of", scenes.of(ask, a, by, slots=scenes.slots)))
 
 
 @coverage.command("novel")
@@ -156,19 +157,18 @@ def novel_(
     ask: FrameAskOptions,
 ) -> None:
     """List the classes of scenes of A that do not occur in B, the rarest first."""
-    from sgstore.testsets.coverage import novel, novel_clips, novel_frames
+    from sgstore.apps.verbs import class_tables
 
-    listed = {"classes": novel, "frames": novel_frames, "clips": novel_clips}[items]
-    frames, than = scenes.of(ask, a, by, slots=scenes.slots)
-    _report_scenes(listed(frames, than), frames, ask, limit)
+    both = scenes.of(ask, a, by, slots=scenes.slots)
+    _report_scenes(class_tables("novel", both, items=items)[0], both[0], ask, limit)
 
 
 @coverage.command("venn")
 def venn_(a: str, b: str, *, scenes: SceneOptions, ask: FrameAskOptions) -> None:
     """Count the classes of scenes that occur in A and B, only in A, and only in B."""
-    from sgstore.testsets.coverage import venn
+    from sgstore.apps.verbs import class_tables
 
-    ask.report(venn(*scenes.of(ask, a, b, slots=scenes.slots)))
+    ask.report(*class_tables("venn", scenes.of(ask, a, b, slots=scenes.slots)))
 
 
 @coverage.command("growth")
@@ -182,10 +182,10 @@ def growth_(
     ask: FrameAskOptions,
 ) -> None:
     """Compare the growth of the number of scene classes with frames in random order."""
-    from sgstore.testsets.coverage import growth
+    from sgstore.apps.verbs import class_tables
 
-    (frames,) = scenes.of(ask, a, slots=scenes.slots)
-    table = growth(frames, unit, points)
+    frames = scenes.of(ask, a, slots=scenes.slots)
+    (table,) = class_tables("growth", frames, unit=unit, points=points)
     ask.report(table)
     if picture is not None and table.rows:
         from sgstore.draw import draw_growth
@@ -219,17 +219,18 @@ def combos_(
     top
         Features in the picture, most gaps first.
     """
+    from sgstore.apps.verbs import listed
     from sgstore.testsets.coverage import combos
 
+    asked = {"missing": missing, "covered": covered}
     if slots is not None:
         if by or of_ego:
             raise typer.BadParameter("--slots cannot be combined with --by or --of-ego")
-        _report_slots(a, slots, k, ask, (1 if covered else 2 if missing else 0, limit), picture)
+        _report_slots(a, slots, k, ask, asked, limit, picture)
         return
     ours, *others = WindowOptions(abstraction).of(ask, a, *([] if by is None else [by]))
     found = combos(ours, abstraction, k, *others, of_ego=of_ego)
-    listed = found.missing if missing else found.covered() if covered else found.shares
-    _report_below(found.shares, listed, ask, limit)
+    _report_below(found.shares, listed(found, **asked), ask, limit)
     if picture is not None:
         from sgstore.draw import draw_matrix
 
@@ -253,6 +254,7 @@ def sequences_(
     ask: FrameAskOptions,
 ) -> None:
     """Count the sequences of k manoeuvres, such as (car stops, ego stops)."""
+    from sgstore.apps.verbs import listed
     from sgstore.testsets.coverage import manoeuvres_named, sequences
 
     named = manoeuvres_named(manoeuvres or ())
@@ -260,8 +262,8 @@ def sequences_(
     say_left_out(ours)
     say_scope(ours.scope(world=False), ask.chosen)
     found = sequences(ours, k, others[0] if others else None, named, seconds_of(within, "--within"))
-    listed = found.missing if missing else found.covered if covered else found.shares
-    _report_below(found.shares, listed, ask, limit)
+    table = listed(found, missing=missing, covered=covered)
+    _report_below(found.shares, table, ask, limit)
 
 
 @coverage.command("spec")
@@ -285,15 +287,16 @@ def spec_(
     query : QUERY
         'MATCH … RETURN a, b': each combination is a cell.
     """
+    from sgstore.apps.verbs import listed
     from sgstore.testsets.coverage import specification
 
+    asked = {"missing": missing, "covered": covered}
     if (query is None) == (slots is None):
         raise typer.BadParameter("add a query, or a file with --slots FILE")
     if query is None or slots is not None:
         if by or cells:
             raise typer.BadParameter("--slots cannot be combined with --by or --cells")
-        which = 1 if covered else 2 if missing else 0
-        _report_slots(a, slots or Path(), 0, ask, (which, limit), picture)
+        _report_slots(a, slots or Path(), 0, ask, asked, limit, picture)
         return
     if picture is not None:
         raise typer.BadParameter("--picture draws pairs of values of declared slots; add --slots")
@@ -301,8 +304,7 @@ def spec_(
         raise typer.BadParameter("expected only one of --by and --cells")
     chosen, *reference = ask.frames(a, *([by] if by else []))
     say_scope(chosen.scope(world=False), ask.chosen)
-    tables = specification(chosen, query, cells, *reference)
-    ask.report(tables[2 if missing else 1 if covered else 0], limit)
+    ask.report(listed(specification(chosen, query, cells, *reference), **asked), limit)
 
 
 @coverage.command("windows")
@@ -316,10 +318,10 @@ def windows_(
     ask: FrameAskOptions,
 ) -> None:
     """List the classes of windows; a window is a frame with the frames recorded before it."""
-    from sgstore.testsets.coverage import classes
+    from sgstore.apps.verbs import class_tables
 
     (frames,) = WindowOptions(abstraction, window, incomplete).of(ask, a)
-    _report_scenes(classes(frames), frames, ask, limit)
+    _report_scenes(class_tables("classes", [frames])[0], frames, ask, limit)
 
 
 @coverage.command("explain")
@@ -335,10 +337,10 @@ def explain_(
     ask: FrameAskOptions,
 ) -> None:
     """Explain how the scenes of B differ from those of A: the features that differ most."""
-    from sgstore.testsets.coverage import explain
+    from sgstore.apps.verbs import class_tables
 
-    ours, theirs = WindowOptions(abstraction).of(ask, b, by)
-    tables = explain(ours, theirs, abstraction, by_frame=by_frame, depth=depth)
+    options = {"abstraction": abstraction, "by_frame": by_frame, "depth": depth}
+    tables = class_tables("explain", WindowOptions(abstraction).of(ask, b, by), **options)
     _report_below(tables[0], tables[1] if tree else tables[0], ask, limit)
 
 
@@ -407,15 +409,17 @@ def _report_slots(
     slots: Path,
     k: int,
     ask: FrameAskOptions,
-    table: tuple[int, int | None],
+    asked: dict[str, bool],
+    limit: int | None,
     picture: Path | None,
 ) -> None:
-    """Print one table about declared slots, and draw the pairs of their values if requested."""
+    """Print a table of declared slots, and draw the pairs of values."""
+    from sgstore.apps.verbs import listed
     from sgstore.testsets.coverage import Specification, slot_coverage
 
     (chosen,) = ask.frames(text)
     say_scope(chosen.scope(world=False), ask.chosen)
-    ask.report(slot_coverage(chosen, Specification.read(slots), k)[table[0]], table[1])
+    ask.report(listed(slot_coverage(chosen, Specification.read(slots), k), **asked), limit)
     if picture is not None:
         from sgstore.draw import draw_matrix
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,10 +17,10 @@ from sgstore.apps.cli._options import (
     StorePath,
     Traces,
     Verbs,
-    named_and_texts,
     parameters_of,
     say_unknown,
     text_of,
+    text_or_file,
 )
 from sgstore.apps.cli._output import say
 from sgstore.base.output_files import without_controls
@@ -97,29 +96,16 @@ def timeline(
 
 def _asked(
     queries: list[str], files: list[Path], names: list[str], values: Mapping[str, Any]
-) -> dict[str, tuple[str, Mapping[str, Any]]]:
-    """Return the queries to plot, by name of the lane, each with its parameter values."""
+) -> dict[str, tuple[str, Mapping[str, object]]]:
+    """Return the queries to plot by lane name, each with the values of its parameters."""
+    from sgstore.apps.verbs import by_lane, free_name
     from sgstore.lang.library import pattern_named
 
-    found: dict[str, tuple[str, Mapping[str, Any]]] = {}
-    named, queries = named_and_texts(queries)
-    names = [*named, *names]
-    for number, text in enumerate(queries, start=1):
-        found["match" if len(queries) == 1 else f"match {number}"] = text, values
+    lanes: dict[str, str] = {}
     for file in files:
-        found[_free(file.stem, str(file), found)] = text_of(file), values
-    for name in names:
-        one = pattern_named(name)
-        own = {key: value for key, value in values.items() if key in one.parameters}
-        found[_free(name, f"pattern {name}", found)] = one.written(**own), {}
+        lanes[free_name(file.stem, str(file), lanes)] = text_of(file)
+    named = [pattern_named(name).name for name in names]
+    found = by_lane([*map(text_or_file, queries), *named], values, lanes)
     if not found:
         raise typer.BadParameter("add a QUERY, -f FILE or -p NAME")
     return found
-
-
-def _free(name: str, longer: str, taken: Mapping[str, object]) -> str:
-    """Return an unused name for a lane of a timeline: the short or the longer name, possibly numbered."""
-    if name not in taken:
-        return name
-    numbers = (f"{longer} ({number})" for number in count(2))
-    return next(one for one in chain([longer], numbers) if one not in taken)

@@ -69,7 +69,7 @@ def coverage(store: Store, what: str, abstraction: str) -> dict[str, Any]:
         return {**_table(table), "words": phrases(store, shown)}
     found = combos(of, abstraction, 2)
     return {"shares": _table(found.shares), "missing": _table(found.missing)} | {
-        "covered": _table(found.covered())
+        "covered": _table(found.covered)
     }
 
 

@@ -264,6 +264,7 @@ class Combos:
         rows = zip(self.found.texts(self.gaps), often, queries, strict=True)
         return ReportTable(("combination", "frames_in_reference", "query"), list(rows))
 
+    @property
     def covered(self) -> ReportTable:
         """Return a table of the occurring combinations of features, the most frequent first."""
         found = self.found
