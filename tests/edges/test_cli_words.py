@@ -18,6 +18,8 @@ from sgstore.apps.assistant import StoreTools, server_of
 from sgstore.apps.cli import app, run
 from sgstore.apps.cli._options import OLD_WORDS, library_help
 from sgstore.base.docstrings import split_docstring
+from sgstore.draw import draw_stored
+from sgstore.ingest import ingest
 from sgstore.query import Store, StoreVerbs
 
 COMMANDS = verbs(typer.main.get_command(app))
@@ -25,8 +27,25 @@ PATHS = [
     *("select", "prioritize", "criticality", "diff", "report", "export", "timeline"),
     *(path for path in COMMANDS if path.startswith("coverage ")),
     *("verify", "lock verify", "like", "shrink"),
+    *("find", "why-not", "sql", "check", "payload", "info", "ingest", "show"),
 ]
 """Commands with a method of the library."""
+
+FUNCTIONS = {"ingest": ingest, "show": draw_stored}
+"""Commands whose method passes its options on to a function."""
+
+WITHOUT_METHOD = {
+    **dict.fromkeys(("doctor", "map", "lint", "translate"), "about a file, not a store"),
+    **dict.fromkeys(("record", "monitor", "demo", "try"), "a recording, or a simulator"),
+    **dict.fromkeys(("serve", "mcp"), "a server"),
+    **dict.fromkeys(("config", "docs"), "about the package"),
+    **dict.fromkeys(("import", "remove", "rebuild", "derive"), "a function of the library"),
+    **dict.fromkeys(
+        (path for path in COMMANDS if path.split()[0] in {"patterns", "collection"}), "a group"
+    ),
+    **dict.fromkeys(("lock list", "lock union", "lock intersect", "lock minus"), "methods of Lock"),
+}
+"""Commands without a method of a store, each with its reason."""
 
 OWN_OPTIONS = {
     *("store", "file", "name", "names", "files", "checks", "every", "quiet", "verbose", "a", "b"),
@@ -51,8 +70,39 @@ DIFFERENT = {
 }
 """Differences that stay, each with its reason."""
 
+ADDED = {
+    "find": {"count", "explain", "each_frame", "safe"},  # methods of Matches; a process of its own
+    "sql": {"statement", "each", "safe"},  # its text; the stores of a collection; a process
+    "check": {"explain", "texts", "junit", "sarif", "evidence", "library"},  # files for others
+    "info": {"traces"},  # fewer rows
+    "payload": {"message"},  # Store.picture has the picture
+    "ingest": {
+        "config",
+        "preset",
+        "ego",
+        "shard",
+    },  # objects in Python: config, egos; of collections
+    "show": {"fps"},  # of a clip: Store.animate
+}
+"""Options of commands that their method lacks, each with its reason."""
+
+OWN_SENTENCES = {
+    ("payload", "channel"): "without it, the command lists the topics",
+    **dict.fromkeys(
+        (
+            (path, name)
+            for path, of in FUNCTIONS.items()
+            for name in inspect.signature(of).parameters
+        ),
+        "texts in place of objects",
+    ),
+}
+"""Options with a sentence of the command, each with its reason."""
+
 
 def method_of(path: str) -> Any:
+    if path in FUNCTIONS:
+        return FUNCTIONS[path]
     (word, *_) = (word for word in path.split() if word != "lock")
     return getattr(Store, word.replace("-", "_"))
 
@@ -78,6 +128,19 @@ def shared(path: str) -> dict[str, tuple[Any, inspect.Parameter]]:
     }
 
 
+def test_every_command_is_compared_or_has_a_reason() -> None:
+    assert {*PATHS}.isdisjoint(WITHOUT_METHOD)
+    assert {*COMMANDS} == {*PATHS, *WITHOUT_METHOD}
+
+
+def test_every_method_with_the_words_of_a_command_is_compared() -> None:
+    compared = {one for path in PATHS for one in path.replace("-", "_").split()}
+    verbs_of_stores = {name for name in vars(StoreVerbs) if not name.startswith("_")}
+
+    assert verbs_of_stores <= compared
+    assert {*vars(Store)} & {path.replace("-", "_") for path in WITHOUT_METHOD} == set()
+
+
 @pytest.mark.parametrize("path", PATHS)
 def test_a_command_has_the_words_of_its_method(path: str) -> None:
     known = inspect.signature(method_of(path)).parameters
@@ -85,9 +148,11 @@ def test_a_command_has_the_words_of_its_method(path: str) -> None:
     for name, (option, parameter) in shared(path).items():
         required = parameter.default is parameter.empty or option.required
         assert required or plain(option.default) == plain(parameter.default), name
-        if name not in OWN_OPTIONS | {"query", "queries", "parameters", "ignore", "clip", "frame"}:
+        own = OWN_OPTIONS | {"query", "queries", "parameters", "ignore", "clip", "frame"}
+        if name not in own and (path, name) not in OWN_SENTENCES:
             assert option.help in {None, "", about[name]}, name
-    extra = {one.name for one in COMMANDS[path].params} - known.keys() - OWN_OPTIONS
+    own = OWN_OPTIONS | ADDED.get(path, set())
+    extra = {one.name for one in COMMANDS[path].params} - known.keys() - own
     extra = {name for name in extra if (path, name) not in DIFFERENT}
     assert extra <= {"query", "parameters", "split", "payloads", "queries", "describe"}, path
     for one in COMMANDS[path].params:
@@ -115,6 +180,48 @@ def test_types_are_the_same() -> None:
                 assert "".join(one) in shown, (path, name, shown)
             if kind == "bool":
                 assert option.is_flag, name
+            if re.fullmatch(r"(?:int|float)(?: \| None)?", kind):
+                if name in {"since", "until"}:  # texts such as 10s
+                    continue
+                shown = option.display_type(typer.Context(COMMANDS[path]))
+                assert re.search(r"(?i)int|float|number", shown), (path, name, shown)
+
+
+OF_TOOLS = {"export_clips": "export", "coverage_missing": "coverage", "list_traces": "traces"}
+"""Tools of assistants → methods with another name."""
+
+TOOLS_ALONE = {"vocabulary": "the pages of the documentation", "patterns_search": "patterns search"}
+"""Tools without a method, each with its counterpart."""
+
+JSON_TYPES = {"bool": "boolean", "int": "number", "float": "number", "Sequence": "array"} | {
+    "list": "array",
+    "Mapping": "object",
+    "dict": "object",
+}
+"""Types of Python → types of JSON; all others are texts."""
+
+
+def json_types(schema: dict[str, Any]) -> set[str]:
+    """The types of an argument in a JSON schema, without null."""
+    several = [one["type"] for one in schema.get("anyOf", [schema])]
+    return {"number" if one == "integer" else one for one in several} - {"null"}
+
+
+def test_every_tool_is_compared_and_has_the_types_of_its_method() -> None:
+    compared = set[str]()
+    for tool in asyncio.run(_tools()):
+        method = getattr(Store, OF_TOOLS.get(tool.name, tool.name), None)
+        assert (method is None) is (tool.name in TOOLS_ALONE), tool.name
+        known = {} if method is None else inspect.signature(method).parameters
+        for name, schema in tool.input_schema["properties"].items():
+            if name in known and not str(known[name]).startswith("*"):
+                words = str(known[name].annotation).split(" | ")
+                kinds = {JSON_TYPES.get(word.partition("[")[0], "string") for word in words}
+                assert json_types(schema) <= kinds, (tool.name, name)
+                compared.add(tool.name)
+    assert compared >= {"find", "why_not", "timeline", "show", "picture", *OF_TOOLS} - {
+        "list_traces"
+    }
 
 
 def test_tools_of_assistants_have_the_same_words() -> None:
