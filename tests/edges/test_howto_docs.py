@@ -73,6 +73,10 @@ FILES: dict[str, Callable[[Path], None]] = {
 """Page → files of its reader."""
 
 
+def test_every_task_has_a_page() -> None:
+    assert {*PAGES} == FILES.keys()
+
+
 @pytest.mark.parametrize("name", PAGES)
 def test_a_page_works_in_its_order(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -91,6 +95,20 @@ def test_a_page_works_in_its_order(
             tomllib.loads(body)
         if language == "python":
             exec(body, {})
+        if language == "text" and "import " in body:
+            compile(body, name, "exec")  # it needs packages of other projects
+        if language == "sql":
+            assert run(["sql", "drives.sgstore", body]) == 0, capsys.readouterr()
+        assert language in {
+            "console",
+            "python",
+            "sgql",
+            "sgql-check",
+            "sql",
+            "text",
+            "toml",
+            "yaml",
+        }
         if language == "console":
             for line in body.replace("\\\n", "").splitlines():
                 program, *arguments = shlex.split(line.removeprefix("$ "), comments=True)
