@@ -80,6 +80,7 @@ from sgstore.temporal._robustness import (
     Robustness,
     apart_from_absence,
     condition_text,
+    least_values,
     margin_columns,
 )
 from sgstore.temporal._verdicts import (
@@ -103,6 +104,7 @@ if TYPE_CHECKING:
     from sgstore.lang.sql import Window
     from sgstore.model.world import Bools, Floats, Ints
     from sgstore.store import StoreFile
+    from sgstore.temporal._plan import Ask
     from sgstore.temporal._trace_group import TraceReader
 
     Codes = NDArray[np.int8]
@@ -382,6 +384,12 @@ class StoreCheck:
         self._lasting = kept_throughout(check)
         ranked = self._lasting or check.formula
         self._ranked = self._plan.margin(ranked, WHOLE) if margins else None
+        self._least: list[Ask] = []
+        always = None if self._quantity is None else always_true(self._quantity)
+        if always is not None and not margins:
+            for name, known in least_values(self._plan, always).items():
+                self._least.append(replace(self._plan.signals[name], least=known))
+                self._plan.signals[name] = self._least[-1]
         self._people: dict[int, dict[str, dict[int, str]]] = {}
 
     @cached_property
@@ -414,15 +422,21 @@ class StoreCheck:
     def verdicts(self) -> Iterator[Verdict]:
         """Yield the verdict of the check on each trace, in the order of trace names."""
         known = (
-            self._verdict(trace) for trace in self.readers(premises=self._premises) if len(trace)
+            self._verdict(trace) for trace in self.readers(premises=self._narrowing) if len(trace)
         )
         yield from merge(known, self.unknown(), key=lambda verdict: natural(verdict.trace))
 
     @cached_property
     def _premises(self) -> Premises | None:
+        """Premises of a verdict. The status of each frame needs all data, without premises."""
         asks = self._plan.asks | self._values.asks
         found = premises_of(self._check, self._plan, self._formula, asks)
         return None if self._want_status else found
+
+    @property
+    def _narrowing(self) -> Premises | None:
+        """Premises that limit the data to read. Robustness needs the values of all entities."""
+        return None if self._check.robustness else self._premises
 
     def readers(
         self, within: Window | None = None, *, premises: Premises | None = None
@@ -514,7 +528,7 @@ class StoreCheck:
         if self._premises is not None and not self._premises.left(trace.relations):
             absent = self._absences.get(trace.trace_id, 0)
             found = Verdict(self._check.name, trace.name, "true", absent_frames=absent)
-            return within_range(found, short)
+            return self._with_robustness(within_range(found, short), trace)
         levels = self._levels(trace, FAVOURABLE)
         judged = self._judged(trace, levels)
         strict, other = levels, judged
@@ -541,9 +555,14 @@ class StoreCheck:
             found = replace(found, reason=self._reason(trace, strict, other))
         if word == "true":
             found = replace(found, absent_frames=self._absences.get(trace.trace_id, 0))
-        found = within_range(found, short)
+        return self._with_robustness(within_range(found, short), trace, levels)
+
+    def _with_robustness(
+        self, found: Verdict, trace: TraceReader, levels: list[Level] | None = None
+    ) -> Verdict:
         if self._quantity is None:
             return found
+        levels = self._levels(trace, FAVOURABLE) if levels is None else levels
         robustness = self._robustness(self._quantity, trace, levels)
         if self._apart is not None:
             without = partial(self._robustness, self._apart, trace, levels)
@@ -610,18 +629,8 @@ class StoreCheck:
 
     def _robustness(self, quantity: Formula, trace: TraceReader, levels: list[Level]) -> Robustness:
         """Return the robustness of the check on a trace: positive if true, negative if false."""
-        kinds, members = self._alike(trace, innermost(levels))
-        ends: list[tuple[float, int | None]] = []
-        for sign in (UNFAVOURABLE, FAVOURABLE):
-            size = max(trace.together // MARGIN_CELLS, 1)
-            parts = [np.zeros(0)]
-            for low in range(0, len(kinds), size):
-                some = kinds[low : low + size]
-                value = self._margins(quantity, trace, some, sign).value(quantity)[:, 0]
-                parts.append(np.broadcast_to(value, len(some)))
-            ends.append(folded_margins(levels, np.concatenate(parts)[members]))
-            if not self._plan.doubts:
-                break
+        sides = self._sides(quantity, trace, innermost(levels))
+        ends = [folded_margins(levels, margins) for margins in sides]
         (value, row), most = ends[0], ends[-1][0]
         upper = None if most == value else most
         if row is None:
@@ -636,6 +645,45 @@ class StoreCheck:
         name, at = decisive
         when = int(trace.numbers[at]), int(trace.times[at]), trace.seconds(at)
         return Robustness(value, condition_text(self._plan, name), *when, nodes, called, upper)
+
+    def _sides(self, quantity: Formula, trace: TraceReader, bindings: Keys) -> Iterator[Floats]:
+        """Yield the robustness margins (B,) of the check for each combination of entities.
+
+        Unknown values count against the check. If there may be some, further margins count them in its favour.
+        """
+        least = self._least_margins(trace, bindings)
+        if least is not None:
+            yield least
+            return
+        kinds, members = self._alike(trace, bindings)
+        size = max(trace.together // MARGIN_CELLS, 1)
+        for sign in (UNFAVOURABLE, FAVOURABLE):
+            parts = [np.zeros(0)]
+            for low in range(0, len(kinds), size):
+                some = kinds[low : low + size]
+                value = self._margins(quantity, trace, some, sign).value(quantity)[:, 0]
+                parts.append(np.broadcast_to(value, len(some)))
+            yield np.concatenate(parts)[members]
+            if not self._plan.doubts:
+                return
+
+    def _least_margins(self, trace: TraceReader, bindings: Keys) -> Floats | None:
+        """Return the robustness margins (B,) if only least values count, and all values are known."""
+        doubts = {doubt for _, doubt in self._plan.states.values() if doubt is not None}
+        if not self._least or any(len(trace.relations[name].frames) for name in doubts):
+            return None
+        found = np.full(len(bindings), np.inf)
+        for ask in self._least:
+            table = trace.relations[ask.name]
+            numbers = np.ma.filled(np.ma.asarray(table.values[0], np.float64), np.nan)
+            if np.isnan(numbers).any():
+                return None
+            if len(numbers):
+                columns = [self._variables.index(name) for name in ask.variables]
+                places = table.find(bindings[:, columns])
+                least = np.append(np.minimum.reduceat(numbers, table.starts[:-1]), np.inf)
+                found = np.minimum(found, least[places])
+        return found
 
     def margins(self, trace: TraceReader) -> Floats:
         """Return the robustness margins of the check on a trace. NaN means that only unknown numbers decide.
@@ -724,12 +772,12 @@ class StoreCheck:
             return np.concatenate([part.any(axis=1) for part in parts])
 
         injective, quantifiers = self._check.injective, self._check.quantifiers
-        if self._premises is not None:
+        if self._narrowing is not None:
             free = {
                 name: ids[~np.isin(ids, apart)] if injective else ids
                 for name, ids in domains.items()
             }
-            few = bindings_of(self._premises, trace, self._variables, free, injective=injective)
+            few = bindings_of(self._narrowing, trace, self._variables, free, injective=injective)
             return levels_among(quantifiers, few, counts=counts)
         return levels_of(quantifiers, domains, apart=apart if injective else None, counts=counts)
 

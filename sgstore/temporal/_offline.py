@@ -15,6 +15,7 @@ import numpy as np
 
 from sgstore.errors import QueryError
 from sgstore.lang import ir as b
+from sgstore.lang.bind import has_pairs
 from sgstore.lang.operators import Column
 from sgstore.lang.sql import (
     BUCKETS,
@@ -36,7 +37,13 @@ from sgstore.temporal._plan import Ask, ask_text
 from sgstore.temporal._robustness import MARGIN_CELLS, MarginTable, margin_columns
 from sgstore.temporal._signal_values import SignalValues
 from sgstore.temporal._signals import evaluate_rows
-from sgstore.temporal._trace_group import TimedRelation, TraceGroup, TraceReader, ordering
+from sgstore.temporal._trace_group import (
+    TimedRelation,
+    TraceGroup,
+    TraceReader,
+    codes_of,
+    ordering,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -376,8 +383,8 @@ def read(
     about = chosen_traces(file, whole, catalog)
     group = TraceGroup.of(about, frame_times(file, window), gaps)
     rows, memory = 0, file.memory
-    for names in _together(asks, premises):
-        ask = asks[names[0]]
+    for leader, names in _together(asks, premises).items():
+        ask = asks[leader]
         left = _left(ask, group, premises)
         narrower = _narrowed(ask, group, left, premises)
         if narrower is None:
@@ -385,34 +392,54 @@ def read(
             continue
         size = ROW_BYTES + EDGE_BYTES * len(ask.edges)
         where = window if left.all() else _window_of(group.ids[left].tolist(), catalog)
-        values = {name: asks[name].value for name in names}
-        many = _relate(file, catalog, values, narrower, where, group, memory // size)
+        named = {name: asks[name] for name in names}
+        many = _relate(file, catalog, named, narrower, where, group, memory // size)
         rows, memory = rows + many, memory - many * size
     return group, rows
 
 
-def _together(asks: Mapping[str, Ask], premises: Premises | None) -> list[list[str]]:
-    """Group the names of queries that differ only in the value that they return for each match."""
-    groups: list[list[str]] = []
-    for name in asks if premises is None else premises.order:
-        ask = asks[name]
-        if groups and _differ_in_value(ask, asks[groups[-1][0]]):
-            groups[-1].append(name)
-        else:
-            groups.append([name])
+def _together(asks: Mapping[str, Ask], premises: Premises | None) -> dict[str, list[str]]:
+    """Return groups of names of queries that are read together: name of the first query → all names.
+
+    The other queries of a group return values of the same matches, or are conditions on them.
+    """
+    order = list(asks) if premises is None else premises.order
+    groups: dict[str, list[str]] = {}
+    for name in order:
+        leaders = order if premises is None else list(groups)[-1:]
+        led = (one for one in leaders if _is_among(asks[name], asks[one], premises))
+        groups.setdefault(next(led, name), []).append(name)
     return groups
 
 
-def _differ_in_value(ask: Ask, other: Ask) -> bool:
-    """True if two queries return different values for the same matches."""
-    one, two = ask.query.scope, other.query.scope
+def _is_among(ask: Ask, leader: Ask, premises: Premises | None) -> bool:
+    """True if the matches of a query are those of a leader with a value, or those that meet a condition.
+
+    The conditions are such that the matches of the leader are not slower to find: numbers of two entities.
+    Premises limit the matches of conditions, so their queries come first.
+    """
+    if leader.value is None or ask.edges or leader.edges:
+        return False
+    one, two = ask.query.scope, leader.query.scope
+    if (
+        (ask.variables, ask.after) != (leader.variables, leader.after)
+        or (one.nodes, one.edges, one.distinct) != (two.nodes, two.edges, two.distinct)
+        or replace(ask.query, scope=two) != leader.query
+    ):
+        return False
+    if ask.value is not None or premises is not None:
+        return ask.value is not None and one.where == two.where
+    more = _conditions_among(ask, leader)
     return (
-        not (ask.value is None or other.value is None or ask.edges or other.edges)
-        and (ask.variables, ask.after) == (other.variables, other.after)
-        and (one.nodes, one.edges, one.where, one.distinct)
-        == (two.nodes, two.edges, two.where, two.distinct)
-        and replace(ask.query, scope=two) == other.query
+        len(more) == len(one.where) - len(two.where)
+        and any(map(has_pairs, more))
+        and not any(map(b.blocks_of, more))
     )
+
+
+def _conditions_among(ask: Ask, leader: Ask) -> list[Bound]:
+    wider = leader.query.scope.where
+    return [one for one in ask.query.scope.where if one not in wider]
 
 
 def _narrowed(ask: Ask, group: TraceGroup, left: Bools, premises: Premises | None) -> Ask | None:
@@ -575,38 +602,68 @@ def _keys(ask: Ask, arrays: Mapping[str, Any], rows: int) -> Keys:
 def _relate(
     file: StoreFile,
     catalog: Catalog,
-    named: Mapping[str, Bound | None],
-    ask: Ask,
+    asks: Mapping[str, Ask],
+    leader: Ask,
     window: Window | None,
     group: TraceGroup,
     most: int,
 ) -> int:
-    """Run one single-frame query, add its matches to a group of traces, and return their number.
+    """Run the query of a leader, add its matches to a group of traces, and return their number.
 
-    ``named`` has the value of the matches for each name, ``most`` is the largest number allowed.
+    ``asks`` are the queries that are read with it, ``most`` is the largest number allowed.
     """
-    if ask.everywhere:
+    if leader.everywhere:
         starts = group.starts.copy()
         keys = np.arange(len(group.ids))[:, None]
         table = TimedRelation(keys, starts, np.arange(len(group.frame_ids)))
-        group.relations |= dict.fromkeys(named, table)
+        group.relations |= dict.fromkeys(asks, table)
         return 0
-    asked = [value for value in named.values() if value is not None]
-    if not asked:
-        table = group.table(*masks_of(file, catalog, ask, window, most))
-        group.relations |= dict.fromkeys(named, table)
+    if leader.value is None:
+        table = group.table(*masks_of(file, catalog, leader, window, most))
+        group.relations |= dict.fromkeys(asks, table)
         return len(table.frames)
-    ids, keys, values = arrays_of(file, catalog, ask, window, asked, most)
-    told = 1 + len(ask.columns)
+    asked = [
+        b.all_of(*_conditions_among(ask, leader)) if ask.value is None else ask.value
+        for ask in asks.values()
+    ]
+    ids, keys, values = arrays_of(file, catalog, leader, window, asked, most)
+    told = 1 + len(leader.columns)
     frames = group.places(ids)
-    if frames.min(initial=0) < 0:
-        known = frames >= 0
+    keys = np.column_stack((group.owners(frames), keys))
+    known = (frames >= 0) & _deciding(asks, keys, values)
+    if not known.all():
         frames, keys = frames[known], keys[known]
         values = [value[known] for value in values]
-    keys = np.column_stack((group.owners(frames), keys))
     order = ordering([*keys.T[:told], frames, *keys.T[told:]])
     keys, frames = keys[order, :told], frames[order]
     table = TimedRelation.ordered(frames, keys, [value[order] for value in values])
-    for number, name in enumerate(named):
-        group.relations[name] = replace(table, values=table.values[number : number + 1])
+    for (name, ask), value in zip(asks.items(), table.values, strict=True):
+        if ask.value is None:
+            true = np.ma.filled(value, fill_value=False)
+            rows = np.repeat(table.keys, np.diff(table.starts), axis=0)[true]
+            group.relations[name] = TimedRelation.ordered(table.frames[true], rows)
+        else:
+            group.relations[name] = replace(table, values=(value,))
     return len(ids)
+
+
+def _deciding(asks: Mapping[str, Ask], keys: Keys, values: Sequence[Any]) -> Bools:
+    """Return a mask of the rows that are needed, if only least values of a trace and its nodes count.
+
+    Rows that meet a condition, and those with an unknown value, are always needed.
+    """
+    lowest = {name for name, ask in asks.items() if ask.least is not None}
+    signals = {name for name, ask in asks.items() if ask.value is not None}
+    if not lowest or signals != lowest.union(*(asks[name].least or () for name in lowest)):
+        return np.ones(len(keys), np.bool_)
+    found, codes = np.zeros(len(keys), np.bool_), codes_of(keys)
+    for (name, ask), column in zip(asks.items(), values, strict=True):
+        unknown = np.ma.getmaskarray(column)
+        found |= np.ma.filled(column, fill_value=False) if ask.value is None else unknown
+        if name in lowest:
+            numbers = np.where(unknown, np.nan, np.ma.getdata(column))
+            found |= np.isnan(numbers)
+            least = np.full(int(codes.max(initial=-1)) + 1, np.inf)
+            np.fmin.at(least, codes, numbers)
+            found |= numbers == least[codes]
+    return found

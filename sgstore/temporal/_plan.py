@@ -70,6 +70,9 @@ class Ask:
         these edges, the alphabetically first relations win.
     after : tuple of Ask
         Steps queried earlier. This query skips nodes for which they never hold.
+    least : frozenset of str or None
+        For a signal of which only the least values of a trace count for each binding: the signals of the same
+        matches whose values must be known.
     """
 
     name: str
@@ -78,6 +81,7 @@ class Ask:
     value: b.Bound | None = None
     edges: tuple[str, ...] = ()
     after: tuple[Ask, ...] = ()
+    least: frozenset[str] | None = None
 
     @property
     def columns(self) -> tuple[str, ...]:

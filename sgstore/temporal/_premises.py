@@ -98,7 +98,7 @@ def premises_of(
 ) -> Premises | None:
     """Return the query sets without whose matches a check is true. ``None`` if every trace needs evaluation."""
     for_all = all(quantifier.word == "FORALL" for quantifier in check.quantifiers)
-    if not for_all or check.gaps == "unknown" or check.robustness:
+    if not for_all or check.gaps == "unknown":
         return None
     found = _Ways(plan).ways(formula, value=False)
     return None if found == _ALWAYS else Premises(found, asks)

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from sgstore.lang import ir as b
 from sgstore.lang.help import in_words
 from sgstore.lang.sql import value_text
 from sgstore.temporal._check_plan import CheckPlan, base_name
@@ -40,13 +41,13 @@ from sgstore.temporal._signals import PropositionTable
 from sgstore.temporal._windows import greatest
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from numpy.typing import NDArray
 
     from sgstore.lang.operators import Column
     from sgstore.model.world import Bools, Floats, Ints
-    from sgstore.temporal._plan import Plan, Test
+    from sgstore.temporal._plan import Ask, Plan, Test
 
     Places = NDArray[np.int32 | np.int64]
 
@@ -179,6 +180,57 @@ def margin_columns(
         else:
             found[name] = margin_of_flags(flags(name))
     return found
+
+
+def least_values(plan: CheckPlan, always: Formula) -> dict[str, frozenset[str]]:
+    """Return the signals of which the margin of ``ALWAYS p`` needs only the least values.
+
+    Then each margin in p is the known value of a signal, and frames without its entities count in favour. The
+    result is empty for any other p, because a frame with another value may decide.
+
+    Parameters
+    ----------
+    plan : CheckPlan
+    always : Formula
+        Formula of p for its margin.
+
+    Returns
+    -------
+    dict of str to frozenset of str
+        Signal → signals of the same matches whose values must be known.
+    """
+    found: dict[str, frozenset[str]] = {}
+    seen: set[str] = set()
+    for part in always.operands if isinstance(always, And) else (always,):
+        match part:
+            case Or((And((Proposition(margin), Proposition(known))), Not(excluded))):
+                either = excluded.operands if isinstance(excluded, Or) else (excluded,)
+                names = {base_name(one.name) for one in either if isinstance(one, Proposition)}
+            case _:
+                return {}
+        test = plan.tests[margin]
+        others = [plan.tests[name] for name in names & plan.tests.keys()]
+        states = {of.name for one in others for of in _states_in(plan, one)}
+        if (
+            len(names) < len(either)
+            or len(others) < len(names)
+            or known not in names
+            or test.expression not in test.signals
+            or any(isinstance(p, b.SignalCall) for one in others for p in b.walk(one.expression))
+            or not states & plan.signals.keys()
+        ):
+            return {}
+        found[test.signals[test.expression].name] = frozenset(states & plan.signals.keys())
+        seen |= {margin, *names}
+    return found if seen == plan.tests.keys() else {}
+
+
+def _states_in(plan: CheckPlan, test: Test) -> Iterator[Ask]:
+    """Yield the queries whose values must be known for a test."""
+    for signal in test.signals.values():
+        of, _ = plan.states.get(signal.name, (None, None))
+        if of is not None:
+            yield of
 
 
 class MarginTable:

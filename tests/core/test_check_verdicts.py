@@ -286,6 +286,18 @@ def test_an_unknown_value_bounds_robustness() -> None:
     assert found.upper == pytest.approx(3.0)
 
 
+@pytest.mark.parametrize("also", ["", " AND dist(ego, v) > 2"])
+def test_an_unknown_value_counts_against_robustness_only(also: str) -> None:
+    text = f"CHECK c: FORALL (v:Car) ALWAYS (gap(ego, v) > 5{also}) ROBUSTNESS"
+
+    found = judged(text, following(10, without_size))
+
+    assert found.verdict == "unknown"
+    assert found.robustness is not None
+    assert found.robustness.value == -math.inf
+    assert found.robustness.upper == pytest.approx(3.0)
+
+
 def test_a_number_that_does_not_exist_is_not_unknown() -> None:
     scene = following(10, lambda _, other: {**other, "vx": 20.0})
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import random
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -13,7 +13,9 @@ from oracle_robustness import compare, compare_rtamt
 
 from sgstore.apps.cli import run as run_verb
 from sgstore.errors import QueryError
+from sgstore.model.frame_ids import seq_of
 from sgstore.temporal._formula import Bound, Proposition, Until, always, eventually
+from sgstore.temporal._offline import arrays_of
 from sgstore.temporal._robustness import MarginTable
 
 if TYPE_CHECKING:
@@ -85,6 +87,48 @@ def test_a_check_says_by_how_much_by_whom_and_when(town: Store) -> None:
     (plain,) = town.check(text.removesuffix("ROBUSTNESS"))
     assert plain.robustness is None
     assert (plain.verdict, plain.violations) == (verdict.verdict, verdict.violations)
+
+
+@pytest.mark.parametrize(
+    "condition",
+    [
+        "dist(ego, v) > 5",
+        "NOT dist(ego, v) <= 5",
+        "(dist(ego, v) > 5 AND gap(ego, v) > 2)",
+        "(gap(ego, v) > 2 AND v.speed < 12)",
+        "(gap(ego, v) > 2 OR v.speed < 1)",
+        "ttc(ego, v) > 3",
+        "dist(ego, v) > v.speed",
+        "v.length < 6",
+    ],
+)
+def test_robustness_is_the_least_margin_of_all_frames(town: Store, condition: str) -> None:
+    run = town.check(f"CHECK FORALL (v:Vehicle) ALWAYS {condition} ROBUSTNESS")
+
+    ((frames, margins),) = run.margins()
+    (verdict,) = run
+
+    found = verdict.robustness
+    assert found is not None
+    assert found.value == margins.min()
+    assert found.seq == seq_of(frames[np.argmin(margins)])
+
+
+def test_a_check_and_its_robustness_read_pairs_once(
+    town: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows: list[int] = []
+
+    def arrays(*about: Any) -> Any:
+        found = arrays_of(*about)
+        rows.append(len(found[0]))
+        return found
+
+    monkeypatch.setattr("sgstore.temporal._offline.arrays_of", arrays)
+    monkeypatch.delattr("sgstore.temporal._offline.masks_of")
+    list(town.check("CHECK FORALL (v:Vehicle) ALWAYS gap(ego, v) > 2 ROBUSTNESS"))
+
+    assert len(rows) == 1
 
 
 @pytest.mark.parametrize(
