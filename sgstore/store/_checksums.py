@@ -81,20 +81,31 @@ def row_words(columns: Mapping[str, NDArray[Any] | None]) -> Words:
     count = next((len(values) for values in columns.values() if values is not None), 0)
     hashes = np.zeros(count, np.uint64)
     words, shifted = (np.empty(min(count, _AT_ONCE), np.uint64) for _ in range(2))
+    # Masked arrays are slow to slice.
+    parts = [
+        (None, None) if (one := columns[name]) is None else (np.ma.getdata(one), _mask_of(one))
+        for name in sorted(columns)
+    ]
     for first in range(0, count, _AT_ONCE):
         here = slice(first, first + _AT_ONCE)
         mixed = hashes[here]
         word, spare = words[: len(mixed)], shifted[: len(mixed)]
-        for number, name in enumerate(sorted(columns)):
-            values = columns[name]
+        for number, (values, missing) in enumerate(parts):
+            step = np.uint64((number + 1) * _STEP & 0xFFFFFFFFFFFFFFFF)
             if values is None:
-                word[:] = _MISSING
+                mixed += _MISSING ^ step
             else:
-                _words(values[here], word)
-            word ^= np.uint64((number + 1) * _STEP & 0xFFFFFFFFFFFFFFFF)
-            mixed += word
+                np.bitwise_xor(_words(values[here]), step, out=word)
+                if missing is not None:
+                    word[missing[here]] = _MISSING ^ step
+                mixed += word
             _mix(mixed, spare)
     return hashes
+
+
+def _mask_of(values: NDArray[Any]) -> NDArray[np.bool_] | None:
+    mask = np.ma.getmask(values)
+    return None if mask is np.ma.nomask else mask
 
 
 def _mix(words: Words, spare: Words) -> None:
@@ -105,16 +116,12 @@ def _mix(words: Words, spare: Words) -> None:
             words *= factor
 
 
-def _words(values: NDArray[Any], out: Words) -> None:
-    """Write the values of a column as 64-bit words into an output array, for the checksum of rows."""
-    plain = np.ma.getdata(values)
-    if plain.dtype.kind == "f":
-        plain = plain + plain.dtype.type(0)  # merges -0 and 0: DuckDB 1.5 drops the sign
-        out[:] = plain.view(np.uint32 if plain.dtype.itemsize == 4 else np.uint64)
-    else:
-        out.view(np.int64)[:] = plain
-    if (missing := np.ma.getmask(values)) is not np.ma.nomask:
-        out[missing] = _MISSING
+def _words(values: NDArray[Any]) -> NDArray[np.uint32 | np.uint64]:
+    """Return the values of a column as words of up to 64 bits, for the checksum of rows."""
+    if values.dtype.kind != "f":
+        return values.astype(np.int64, copy=False).view(np.uint64)
+    values = values + values.dtype.type(0)  # merges -0 and 0: DuckDB 1.5 drops the sign
+    return values.view(np.uint32 if values.dtype.itemsize == 4 else np.uint64)
 
 
 def as_summed(table: str, columns: Columns, texts: Sequence[str]) -> dict[str, NDArray[Any] | None]:
