@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import shutil
 import subprocess
 import sys
@@ -28,7 +27,7 @@ from explorer_page import (
 )
 from thorough import LONG
 
-from sgstore.apps.demo import RECORDING
+from sgstore.apps.demo import RECORDING, SMALL
 from sgstore.apps.report import inline, report
 from sgstore.ingest import ingest
 from sgstore.lang.library import patterns
@@ -214,7 +213,7 @@ def test_names_of_recordings_stay_text(
     visit: Callable[..., Any], served: Callable[[Path], str], tmp_path: Path
 ) -> None:
     name = "<img src=x onerror=alert(1)><script>alert(2)"
-    recording = Path(shutil.copy(RECORDING, tmp_path / f"{name}.mcap"))
+    recording = Path(shutil.copy(SMALL, tmp_path / f"{name}.mcap"))
     (outcome,) = ingest(tmp_path / "hostile.sgstore", [recording], rate=2.0)
     assert outcome.error is None
     page = visit(served(tmp_path / "hostile.sgstore"))
@@ -318,33 +317,21 @@ def test_a_monitor_is_seen_while_it_runs(visit: Callable[..., Any]) -> None:
         child.communicate(timeout=120)
 
 
-def test_coverage_is_shown_and_a_gap_is_a_query(page: Any) -> None:
-    page.get_by_role("button", name="Coverage").click()
-    page.locator(".chart").wait_for()
-    seen(page, "coverage")
-    page.get_by_role("button", name="Combinations").click()
-    page.get_by_role("columnheader", name="query").first.wait_for()
-    empty = page.get_by_role("columnheader", name="frames in reference")
-    expect(empty).to_have_count(0)  # nothing stands in it without a reference
-    page.get_by_role("button", name="find").first.click()
-    expect(page.locator(".cm-content")).to_have_text(re.compile("^MATCH"))
-
-
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_every_width_and_both_schemes_fit(page: Any, scheme: str) -> None:
-    page.emulate_media(color_scheme=scheme)
+def test_every_width_and_both_schemes_fit(page: Any) -> None:
     search(page, NEAR)
     open_first(page)
     for width, height in ((1280, 800), (2560, 1400)):
         page.set_viewport_size({"width": width, "height": height})
-        page.wait_for_function(
-            """width => {
-              const box = document.querySelector(".above canvas").getBoundingClientRect();
-              return document.documentElement.scrollWidth <= width && box.width > 300 && box.height > 250;
-            }""",
-            arg=width,
-        )
-        seen(page, f"scene-{width}-{scheme}")
+        for scheme in ("light", "dark"):
+            page.emulate_media(color_scheme=scheme)
+            page.wait_for_function(
+                """width => {
+                  const box = document.querySelector(".above canvas").getBoundingClientRect();
+                  return document.documentElement.scrollWidth <= width && box.width > 300 && box.height > 250;
+                }""",
+                arg=width,
+            )
+            seen(page, f"scene-{width}-{scheme}")
 
 
 def test_a_report_plays_from_a_file_without_a_network(
@@ -374,11 +361,9 @@ def test_matches_play_in_a_notebook(
     expect(frame.locator(".transport .time")).not_to_have_text(was)
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_no_serious_fault_of_accessibility(page: Any, scheme: str) -> None:
+def test_no_serious_fault_of_accessibility(page: Any) -> None:
     if not AXE.exists():
         pytest.skip("axe is not installed: python tools/vendor.py --check")
-    page.emulate_media(color_scheme=scheme)
     page.locator(".card .badge").first.wait_for()
     assert faults(page) == []
     search(page, NEAR)

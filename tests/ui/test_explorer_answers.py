@@ -119,27 +119,6 @@ def test_values_of_each_match_are_in_a_table_beside_the_pictures(
     expect(page.locator("tbody tr")).to_have_count(len(Store(town_store).find(text)))
 
 
-def test_a_gap_of_the_matrix_names_both_features(page: Any) -> None:
-    page.get_by_role("button", name="Coverage").click()
-    page.get_by_role("button", name="Matrix of gaps").click()
-    cells = page.locator(".gap-cell")
-    cells.first.wait_for()
-    names = [re.sub(": in no frame$", "", one.get_attribute("aria-label")) for one in cells.all()]
-    place, (one, other) = next(
-        (place, pair)
-        for place, pair in enumerate(name.split(" with ") for name in names)
-        if all(len(feature.split()) == 3 for feature in pair)
-    )
-    cells.nth(place).focus()
-    cells.nth(place).press("Enter")
-    told = page.locator(".nearest")
-    expect(told).to_contain_text("No frame of the store has")
-    for relation in (one.split()[1], other.split()[1]):
-        expect(told).to_contain_text(f"[:{relation}")
-    expect(told).to_contain_text("together with")
-    expect(told.get_by_role("button")).to_have_text(re.compile(r"town#\d+"))
-
-
 def test_without_a_match_the_page_tells_the_part_and_the_nearest_frame(
     page: Any, town_store: Path
 ) -> None:

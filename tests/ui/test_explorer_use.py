@@ -242,7 +242,7 @@ def test_scene_shows_lights_crosswalks_directions_rings_and_a_grid(page: Any) ->
     assert "#20262e" in filled  # the housing of a light
     assert filled & {"#e5383b", "#ffb703", "#2ec4a0"}  # its lamp
     assert "#fdfdfb" in filled  # stripes of crosswalks
-    assert ["#f7f9fb", 0.18, False] in stroked  # arrows of the driving direction
+    assert "#f7f9fb" in {colour for colour, *_ in stroked}  # arrows of the driving direction
     assert "#dfe4dd" not in {colour for colour, *_ in stroked}
     calls = page.evaluate(PAINTS, arg=True)
     assert "#dfe4dd" in {call[2] for call in calls if call[0] == "stroke"}  # the grid without a map
@@ -265,14 +265,32 @@ def test_coverage_is_told_in_words_pictures_and_gaps(page: Any) -> None:
     page.get_by_role("button", name="Stop").click()
     page.unroute("**/api/coverage")
     expect(page.get_by_text("stopped")).to_be_visible()
+    page.get_by_role("button", name="Combinations").click()
+    page.get_by_role("columnheader", name="query").first.wait_for()
+    empty = page.get_by_role("columnheader", name="frames in reference")
+    expect(empty).to_have_count(0)  # nothing stands in it without a reference
+    page.get_by_role("button", name="find").first.click()
+    expect(page.locator(".cm-content")).to_have_text(re.compile("^MATCH"))
+    page.get_by_role("button", name="Coverage").click()
     page.get_by_role("button", name="Matrix of gaps").click()
-    cell = page.locator(".gap-cell").first
-    label = cell.get_attribute("aria-label")
-    cell.focus()
-    cell.press("Enter")
-    assert label.endswith("in no frame")
-    expect(page.locator(".cm-content")).to_contain_text("MATCH")
+    cells = page.locator(".gap-cell")
+    cells.first.wait_for()
+    labels = cells.evaluate_all("all => all.map(one => one.getAttribute('aria-label'))")
+    assert all(label.endswith(": in no frame") for label in labels)
+    pairs = [label.removesuffix(": in no frame").split(" with ") for label in labels]
+    place, pair = next(
+        (place, pair)
+        for place, pair in enumerate(pairs)
+        if all(len(feature.split()) == 3 for feature in pair)
+    )
+    cells.nth(place).focus()
+    cells.nth(place).press("Enter")
     expect(page.locator(".status")).to_contain_text("0 matches")
+    told = page.locator(".nearest")  # both features of the pair, and a frame with one of them
+    for feature in pair:
+        expect(told).to_contain_text(f"[:{feature.split()[1]}")
+    expect(told).to_contain_text("together with")
+    expect(told.get_by_role("button")).to_have_text(re.compile(r"town#\d+"))
 
 
 def test_timeline_zooms_and_marks_frames_by_keys_and_mouse(page: Any) -> None:

@@ -335,7 +335,8 @@ export function paintScene(ctx, trace, states, look, ratio, what) {
  * @param {States} states @param {Look} look @param {Inks} ink @param {Map<number, string>} names */
 function paintNames(ctx, trace, states, look, ink, names) {
   const place = axes(look), c = states.columns;
-  const named = [...names].sort(([a], [b]) => Number(b >= 0) - Number(a >= 0)).flatMap(([node, name]) => { // entities before parts of the map
+  const byPriority = [...names].sort(([a], [b]) => Number(b >= 0) - Number(a >= 0)); // entities before parts of the map
+  const named = byPriority.flatMap(([node, name]) => {
     const at = spotOf(trace, states, node, [look.x, look.y]), row = rowOf(states, node);
     if (!at) return [];
     const angle = (c.heading[row] || 0) + look.turn, cos = Math.abs(Math.cos(angle)), sin = Math.abs(Math.sin(angle));

@@ -13,7 +13,8 @@ const GAP = 12, HEAD = 32;
 const REST = 100; // ms without a jump, after which what flew past stands
 
 /** What the matches before and behind are grouped by. @param {import("./state.js").Match | undefined} match */
-const groupOf = (match) => match?.group ?? (order.value ? ORDERS[order.value] : isOrdered() ? BY_QUERY : match?.trace) ?? "";
+const groupOf = (match) => match?.group ?? (order.value ? ORDERS[order.value] : isOrdered() ? BY_QUERY
+  : match?.trace) ?? "";
 /** True if the query itself orders or chooses its matches. */
 const isOrdered = () => answer.value.lists === "chosen";
 
@@ -100,7 +101,8 @@ function Tile({ match, at, x, y, wide, high, flies, turn, many }) {
         title="tag this match" aria-label=${`Tag ${match.trace} ${start} s`}
         onClick=${(/** @type {Event} */ event) => { event.stopPropagation(); tagged.value = { trace: match.trace,
           first: match.first, last: match.last }; dialog.value = "tag"; }}>+ tag</button>`}
-      ${order.value || (isOrdered() && !match.group) ? html`<span class="faint">${match.trace}</span>` : null}<span class="who" title=${who}>
+      ${order.value || (isOrdered() && !match.group) ? html`<span class="faint">${match.trace}</span>` : null}
+      <span class="who" title=${who}>
         ${who}</span>
     </div></div>`;
 }
@@ -140,7 +142,8 @@ export function Gallery({ found: all, none, word = ["match", "matches"] }) {
     return () => watch.disconnect();
   }, []);
   // Of thousands of matches it is made once, not while it is scrolled.
-  const { rows, height, wide, high } = useMemo(() => layout(found, box.width), [found, box.width, order.value, isOrdered()]);
+  const { rows, height, wide, high } = useMemo(() => layout(found, box.width), [found, box.width, order.value,
+    isOrdered()]);
   const low = Math.max(0, rows.findIndex((row) => row.top + row.height >= box.top - 200)),
     end = box.top + box.height + 200;
   // As many rows each time: rows out of sight lend their elements to new ones, which would take most of the time.

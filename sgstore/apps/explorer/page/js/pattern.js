@@ -92,7 +92,8 @@ export function PatternDrawing({ lanes, holds }) {
 /** Whether some lanes hold, as a sign. @param {{of: number[], holds: (boolean | null)[]}} props */
 function Sign({ of, holds }) {
   const all = allHold(of.map((at) => holds[at]));
-  return html`<b class=${all === null ? "faint" : all ? "holds" : "fails"}>${all === null ? "·" : all ? "✓" : "✗"}</b>`;
+  const [name, sign] = all === null ? ["faint", "·"] : all ? ["holds", "✓"] : ["fails", "✗"];
+  return html`<b class=${name}>${sign}</b>`;
 }
 
 /** Conditions as the query writes them, with the lanes of each; words of the library also with their meaning.

@@ -24,7 +24,8 @@ function Head() {
 function Report() {
   const told = answer.value;
   const body = open.value ? html`<main class="open"><${Gallery} found=${matches.value} /><${Scene} /></main>`
-    : told.rows ? html`<${Rows} />` : told.verdicts ? html`<${Verdicts} /><main><${Gallery} found=${matches.value} /></main>`
+    : told.rows ? html`<${Rows} />`
+    : told.verdicts ? html`<${Verdicts} /><main><${Gallery} found=${matches.value} /></main>`
     : told.state === "done" && !told.matches.length ? html`<div class="sheet"><h2>Nothing matches</h2></div>`
       : html`<main><${Gallery} found=${matches.value} /></main>`;
   return html`<${Head} /><${Status} />${body}

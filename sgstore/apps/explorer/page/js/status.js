@@ -3,7 +3,8 @@
 import { h, htm, useEffect, useState } from "../vendor/core.js";
 import * as api from "./api.js";
 import { BY_QUERY, ORDERS } from "./order.js";
-import { answer, filter, find, framesFound, isPattern, matches, offline, open, order, sought, store, tickAll } from "./state.js";
+import { answer, filter, find, framesFound, isPattern, matches, offline, open, order, sought, store,
+  tickAll } from "./state.js";
 
 const html = htm.bind(h);
 
