@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class CheckInCatalog:
-    """Return the bound columns of a check's ``RETURN`` clause, and its bound ``HAVING`` condition."""
+    """Bound ``CHECK`` statement, with the catalog (of a store or an abstraction) that resolved its names."""
 
     check: b.BoundCheck
     catalog: Catalog
@@ -137,7 +137,7 @@ def _knows_no_more(traces: Iterable[TraceFacts], limit: float) -> bool:
 def _returned(
     written: WrittenCheck, names: SymbolTable
 ) -> tuple[tuple[b.ReturnColumn, ...], b.Bound | None]:
-    """Return the bound columns of a check's ``RETURN``, the values of each violation, and its ``HAVING``."""
+    """Return the bound columns of a check's ``RETURN`` clause, and its bound ``HAVING`` condition."""
     inner = replace(names, over=True)
     found = tuple(bind_column(item, inner) for item in written.returns)
     taken = [node.name for one in written.quantifiers for node in one.nodes]

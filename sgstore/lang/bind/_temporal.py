@@ -99,7 +99,7 @@ def timespan(e: s.Duration, _: SymbolTable) -> b.Value:
 
 
 def course(e: s.Call, names: SymbolTable) -> b.Bound:
-    """Return the bound form of a function over time, such as ``prev(x)`` or ``delta(x, 2s)``.
+    """Return the bound call of a function over time: ``prev(x)``, ``delta(x, 2s)``, ``run_length(p)``, ….
 
     Raises
     ------

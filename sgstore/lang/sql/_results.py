@@ -501,7 +501,7 @@ class _IntervalStatement:
         return expression_text(condition, leaf, self.writer.values)
 
     def _per(self, chosen: Sampling | None, told: dict[str, str]) -> list[str]:
-        """Return the SQL of the value in ``SAMPLE n PER value``.
+        """Return the SQL of the values after ``PER`` in ``SAMPLE n PER value``.
 
         If it is a node, the SQL of its owner follows.
         """
@@ -518,7 +518,7 @@ class _IntervalStatement:
         return per
 
     def _told(self, value: Bound) -> str:
-        """Return the SQL of the values after ``PER`` in ``SAMPLE n PER value``."""
+        """Return the SQL of a returned value, computed from the constant columns of the interval."""
         if value in self.keys and not isinstance(value, NodeAttribute):
             return self.keys[value]
         return expression_text(value, self.keys.__getitem__, self.writer.values)
@@ -528,7 +528,7 @@ class _IntervalStatement:
         return shortest_text(text) if column.single else text
 
     def _keys(self) -> dict[str, str]:
-        """Return the SQL of a returned value, computed from the constant columns of the interval."""
+        """Return the columns that are constant in each interval: column → SQL of the value."""
         # A word of the vocabulary stays an internal number until it is returned.
         texts = [
             _column(value)
