@@ -105,7 +105,7 @@ _CAREFUL: Final = (
     *("common_aggregate", "common_subplan", "compressed_materialization", "duplicate_groups"),
     *("join_filter_pushdown", "late_materialization", "statistics_propagation", "top_n"),
 )
-"""DuckDB optimizers to disable after an internal error. The query then runs again."""
+"""DuckDB optimizers that are disabled for the next attempt after an internal error."""
 
 
 def _be_careful(connection: DuckDBPyConnection) -> None:

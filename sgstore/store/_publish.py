@@ -312,7 +312,7 @@ ORPHANS: Final = "".join(
     f" (SELECT {owner}_id FROM store.inside.{owner});\n"
     for owner in (*SHARED, "trace")
 )
-"""SQL that deletes maps, settings and other shared rows that no trace uses."""
+"""SQL that deletes shared rows (such as maps and settings) and checksums that no trace uses."""
 
 
 def owned(connection: DuckDBPyConnection, database: str) -> Iterator[tuple[str, str]]:

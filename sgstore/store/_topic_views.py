@@ -279,7 +279,7 @@ _NO_TABLE: Final = re.compile(r"Table with name (\S+) does not exist")
 
 
 def _first_ns(recording: Recording) -> int:
-    """Return the log time at which a recording begins, as far as its first messages show; ns."""
+    """Return the log time at which a recording begins, judged from its first messages; ns."""
     for run in recording.walk(Findings()):
         if len(run):
             return int(run.log_time_ns.min())
@@ -335,7 +335,7 @@ def topics_in(path: Path) -> dict[str, TopicFacts]:
 
 
 def fields_in(path: Path, topic: str) -> dict[str, str] | None:
-    """Return the fields of a topic of a recording, with database types. ``None`` means JSON: read it first."""
+    """Return the fields of a recorded topic: name → database type. ``None`` for JSON, to be read first."""
     return _fields_at(path, mark_of(path), topic)
 
 
