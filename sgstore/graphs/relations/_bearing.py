@@ -47,7 +47,7 @@ BESIDE: Final = 1e-3
 
 
 TINY: Final = np.float32(1e-30)
-"""Smallest distance that 32-bit numbers can represent safely; m."""
+"""Distance below which 32-bit numbers underflow; m."""
 
 DOUBT: Final = 4e-6
 """Distance from the limit of a sector within which the exact angle decides; greater than :data:`NOISE`; rad."""
@@ -144,7 +144,7 @@ def _by_bearing(settings: Direction, pairs: BodyPairs, rows: Rows) -> tuple[Rows
 
 
 def _behind(bearing: Floats) -> Bools:
-    """Return a mask of the angles behind ±90°. At the limit itself, the right side counts, as in CARLASGG.
+    """Return a mask of the angles in the rear sector. At ±90°, only the right side counts, as in CARLASGG.
 
     CARLASGG tests its sectors in the order direct front, side front, direct rear, side rear; all of
     them include both bounds. Straight left is 180° in its count; straight right is 360°, not 0°.
