@@ -576,7 +576,7 @@ def _in_favour(expression: b.Bound) -> b.Bound:
 
 
 def _absence_tried(expression: b.Bound, *, counted: bool) -> b.Bound:
-    """Return a condition that holds for both ways, or for one way, to count absent entities.
+    """Combine both ways to count absent entities: by ``OR`` if they count as true, otherwise by ``AND``.
 
     If ``counted``, one result must be true, otherwise both.
     """

@@ -252,7 +252,7 @@ class Premises:
         return sorted(self.asks, key=rank)
 
     def left(self, relations: Mapping[str, TimedRelation]) -> list[frozenset[str]]:
-        """Return the sets in which no query is known to have no matches in a trace."""
+        """Return the sets whose queries all have matches in a trace, as far as they were read."""
         empty = {name for name, one in relations.items() if not len(one.keys)}
         return [one for one in self.alternatives if not one & empty]
 

@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 
 MARGIN_CELLS: Final = 16
-"""Number of bytes of a margin for each byte of a truth value, at most."""
+"""Memory of a margin, as a multiple of the memory of a truth value."""
 
 
 @dataclass(frozen=True, slots=True)
