@@ -387,7 +387,7 @@ def _rows(data: bytes, layout: Any) -> Any:
 
 
 def _pairs(data: bytes) -> list[list[int]]:
-    """Return the pairs of actor ids that collide, without duplicates. Record sizes depend on the version."""
+    """Return the pairs of actor ids that collide, without duplicates. The record size varies with CARLA."""
     (count,) = struct.unpack_from("<H", data)
     size = (len(data) - 2) // count if count else 12
     if size < 12 or len(data) != 2 + count * size:

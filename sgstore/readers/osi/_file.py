@@ -214,7 +214,7 @@ RUN_BYTES: Final = 4 << 20
 """Approximate maximum size of a run of messages; bytes."""
 
 _ENOUGH, _TRIED = 8, 1000
-"""Numbers of messages from which the message type is determined: sufficient if not empty, and at most."""
+"""Numbers of messages that are decoded to find their type: sufficient non-empty ones, and the maximum."""
 _VERSION, _TIMESTAMP = 1, 2
 
 

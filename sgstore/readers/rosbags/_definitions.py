@@ -96,7 +96,7 @@ class Definitions:
         return self._store.generate_msgdef(name, ros_version=2)[0]
 
     def _register(self, text: str, name: str) -> None:
-        """Register the types of a definition that are not known yet."""
+        """Register the types in a definition that are not registered yet."""
         known = self._store.types
         found = _parsed(text, name).items()
         self._store.register({key: value for key, value in found if key not in known})
