@@ -64,7 +64,7 @@ READ_S: Final = 60.0
 REDUCE: Final = (
     "reduce the query: a label for each node, such as (v:Vehicle), fewer variables, one trace"
 )
-"""Remedy for a query that needs too much time or memory."""
+"""Text of the remedy for a query that needs too much time or memory."""
 
 _TABLE_BYTES: Final = 4 << 30
 """Largest file that the sandbox process may write; bytes. It may only write while it reads user tables."""

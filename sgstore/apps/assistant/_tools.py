@@ -51,7 +51,7 @@ MOST_TEXT: Final = 30_000
 """Largest number of characters of the rows in a result; about ten thousand tokens."""
 
 LONGEST: Final = 400
-"""Largest number of characters of a single value. It is larger than a notebook needs to show queries."""
+"""Largest number of characters of one value. It is larger than in notebooks, for texts of queries."""
 
 SIDE: Final = 1_024
 """Longest side of a camera picture for an assistant; pixels. Language models do not use larger pictures."""
