@@ -357,7 +357,7 @@ class RoadMap:
         return self._outlines.copy()
 
     def surface_of(self, lanes: Ints, distance: float) -> LaneSurface:
-        """Return the surroundings of some lanes, counted from 0, up to a distance; m."""
+        """Return the area around some lanes (counted from 0), up to a distance; m."""
         with PREPARED:
             return LaneSurface(self._outlines[1 + lanes], distance)
 
