@@ -356,7 +356,7 @@ class SceneGraphGenerator:
         return self._keeping.entities(kind) & ~self._left_out[node]
 
     def _beyond(self, frames: FrameBlock, poses: EgoPoses, outer: Extent, keys: Ints) -> _Beyond:
-        """Return the surroundings of one ego's graphs. ``keys`` are the rows in the graphs."""
+        """Return the known entities around the graphs of one ego. ``keys`` are the rows inside the graphs."""
         if self._config.range.boundless:
             nowhere = np.full(len(frames), np.nan)
             poses = EgoPoses(nowhere, nowhere, nowhere, nowhere)
@@ -368,7 +368,7 @@ class SceneGraphGenerator:
         return _Beyond(_reduced(frames, kept), areas, others)
 
     def _world(self, frames: FrameBlock, keys: Ints, every: Ints) -> _World:
-        """Return the known entities around the graphs of one ego. ``keys`` are the rows inside the graphs.
+        """Compute the results that all egos share: bodies, pairs, contacts and lanes.
 
         ``keys`` are the rows in the graphs, ``every`` also those of the surroundings.
         """
