@@ -101,7 +101,7 @@ def test_words_of_the_library_are_shown_as_written(store: Store) -> None:
     assert "leads" in parts[-1].meanings[0]
     sequence = f"{define} MATCH (e:Ego), (v:Vehicle) WHERE EVENTUALLY WITHIN 3s lead(e, v)"
     (over_time,) = (one.part for one in store.parts(sequence, "town#50").lanes)
-    assert over_time.text == "EVENTUALLY WITHIN 3s lead(e, v)"
+    assert over_time.text == "EVENTUALLY[0s, 3s] lead(e, v)"
     # Conditions that share a variable without a node are one part, with the call as a whole.
     (whole,) = (one.part for one in store.parts(query, "town#50", {}).lanes)
     assert whole.call == ""
