@@ -111,7 +111,7 @@ def test_values_of_several_matches_are_a_table(page: Any, town_store: Path) -> N
 def test_values_of_each_match_are_in_a_table_beside_the_pictures(
     page: Any, town_store: Path
 ) -> None:
-    text = f"{NEAR} RETURN gap(e, v) AS gap"
+    text = "MATCH (e:Ego)-[:near_coll]->(v:Truck|Van) RETURN gap(e, v) AS gap"
     search(page, text)
     expect(page.locator(".status .note")).to_contain_text("the table has the values of RETURN")
     expect(page.locator(".tile").first).to_be_visible()
