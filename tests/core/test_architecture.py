@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from check import TESTS, WHOLE, part_of, patterns_of
-from house import is_at_home, module_of, survey
+from house import is_at_home, module_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -256,14 +256,6 @@ def folder_of(name: str) -> int | None:
     if package != "lang":
         return None
     return FOLDERS_OF_LANG.index(folder) + 1 if folder in FOLDERS_OF_LANG else 0
-
-
-def test_files_import_one_another_in_one_direction() -> None:
-    assert survey().circles() == []
-
-
-def test_no_two_classes_have_one_name() -> None:
-    assert survey().twice() == {}
 
 
 def test_every_file_has_a_room_in_the_plan() -> None:

@@ -18,6 +18,14 @@ def test_no_figure_rises() -> None:
     assert house.risen(found) == [], "see tools/house.py"
 
 
+def test_files_import_one_another_in_one_direction() -> None:
+    assert house.survey().circles() == []
+
+
+def test_no_two_classes_have_one_name() -> None:
+    assert house.survey().twice() == {}
+
+
 def test_a_figure_above_its_ratchet_is_named() -> None:
     known = house.kept()
     found = {table: dict(values) for table, values in known.items()}
