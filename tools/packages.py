@@ -242,7 +242,8 @@ def try_versions(folder: Path) -> None:
     for programs in (low, high):
         own = folder / f"of-{programs.parent.name}"
         own.mkdir()
-        asked(programs, own, "ingest", "town.sgstore", str(REPOSITORY / "sgstore" / RECORDING))
+        recording = str(REPOSITORY / "sgstore" / RECORDING)
+        asked(programs, own, "ingest", "town.sgstore", recording, "--until", "30s")
     # Each asks what the other made: where rows or answers of one differ, so do these.
     ours = answers(low, folder / "of-high")
     theirs = answers(high, folder / "of-low")
