@@ -286,7 +286,7 @@ def class_tables(  # noqa: PLR0913 - the options of the commands
     if kind == "growth":
         return (of.growth(classed[0], unit, points),)
     if kind == "explain":
-        return of.explain(*classed, abstraction, by_frame=by_frame, depth=depth)
+        return of.explain(classed[0], classed[1], abstraction, by_frame=by_frame, depth=depth)
     return ({"of": of.covered, "venn": of.venn, "novel": chosen}[kind](*classed),)
 
 

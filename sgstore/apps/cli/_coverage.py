@@ -143,7 +143,7 @@ def of_(
     """Measure how much of the frames of A is covered by B, by classes and by frames."""
     from sgstore.apps.verbs import class_tables
 
-    ask.report(*class_tables("of", scenes.of(ask, a, by, slots=scenes.slots)))
+    ask.report(class_tables("of", scenes.of(ask, a, by, slots=scenes.slots))[0])
 
 
 @coverage.command("novel")
@@ -168,7 +168,7 @@ def venn_(a: str, b: str, *, scenes: SceneOptions, ask: FrameAskOptions) -> None
     """Count the classes of scenes that occur in A and B, only in A, and only in B."""
     from sgstore.apps.verbs import class_tables
 
-    ask.report(*class_tables("venn", scenes.of(ask, a, b, slots=scenes.slots)))
+    ask.report(class_tables("venn", scenes.of(ask, a, b, slots=scenes.slots))[0])
 
 
 @coverage.command("growth")
@@ -339,8 +339,8 @@ def explain_(
     """Explain how the scenes of B differ from those of A: the features that differ most."""
     from sgstore.apps.verbs import class_tables
 
-    options = {"abstraction": abstraction, "by_frame": by_frame, "depth": depth}
-    tables = class_tables("explain", WindowOptions(abstraction).of(ask, b, by), **options)
+    both = WindowOptions(abstraction).of(ask, b, by)
+    tables = class_tables("explain", both, abstraction=abstraction, by_frame=by_frame, depth=depth)
     _report_below(tables[0], tables[1] if tree else tables[0], ask, limit)
 
 

@@ -310,6 +310,6 @@ def _seen(statements: Sequence[object], catalog: Catalog, parameters: Mapping[st
                 seen = replace(catalog.under(name) or catalog, only=seen.only)
             elif normalize_name(setting.name) == "dataset":
                 only = traces_in(name, catalog.traces, catalog.tables, part=catalog.part)
-                both = only if None in {only, seen.only} else only & seen.only
+                both = only if only is None or seen.only is None else only & seen.only
                 seen = replace(seen, only=both)
     return seen.in_world() if world else seen
