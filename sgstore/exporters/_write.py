@@ -155,7 +155,9 @@ def _check(export: Export, exporter: Exporter) -> None:
         name = option.name
         if name in some - exporter.options and getattr(export, name) != option.default:
             told = f"--{_SEVERAL.get(name, name).replace('_', '-')}"
-            raise ExportError(f"{told} cannot be used with the format '{exporter.name}'")
+            able = " or ".join(f"--as {one.name}" for one in EXPORTERS if name in one.options)
+            reason = f"{told} cannot be used with the format '{exporter.name}'; add {able}"
+            raise ExportError(reason)
     for clip in export.clips:
         if clip.start_ns > clip.end_ns:
             raise ExportError(

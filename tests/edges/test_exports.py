@@ -688,7 +688,9 @@ def test_networkx_reads_the_graphs_of_the_store(
 
 def test_graphml_is_written_where_it_is_asked_for(written: Callable[..., Path]) -> None:
     assert not [*written("nx").rglob("*.graphml")]
-    with pytest.raises(ExportError, match="--graphml cannot be used with the format 'parquet'"):
+    with pytest.raises(
+        ExportError, match="--graphml cannot be used with the format 'parquet'; add --as nx"
+    ):
         written("parquet", graphml=True)
 
 
