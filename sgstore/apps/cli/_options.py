@@ -409,10 +409,19 @@ _OPTIONS_OF_OTHERS: Final = {
 """Name of an option → names of the same option in other tools."""
 
 
+_OPTIONS_OF_STORE: Final = {"-o", "--to", "--output", "--store", "-s", "--db", "--database"}
+"""Options for a store in other tools. Here a store is the first argument."""
+
+
 def _option_instead(verb: Verb, ctx: Any, args: list[str], name: str) -> str:
     """Return a command line with the right option for an unknown one; an empty text if none is similar."""
     known = sorted({word for one in verb.params for word in (*one.opts, *one.secondary_opts)})
     others = [new for new, words in _OPTIONS_OF_OTHERS.items() if name in words and new in known]
+    if name in _OPTIONS_OF_STORE and name in args[:-1] and _places(verb):
+        place = args.index(name)
+        return shlex.join(
+            [*ctx.command_path.split(), args[place + 1], *args[:place], *args[place + 2 :]]
+        )
     new = next(iter([*others, *get_close_matches(name, known, 1)]), "")
     fixed = [f"{new}{one[len(name) :]}" if one.partition("=")[0] == name else one for one in args]
     return "" if not new or fixed == args else shlex.join([*ctx.command_path.split(), *fixed])
@@ -775,7 +784,7 @@ class Statements:
     texts : TEXT
         'CHECK ALWAYS …'; repeatable.
     sgsm_compat
-        Violated if any prefix of a trace is, as in SGSM.
+        Report a violation if any prefix of a trace violates a check, as SGSM does.
     """
 
     names: PatternNames = None
@@ -908,7 +917,9 @@ def tables_of(given: list[str] | None) -> dict[str, Path]:
 
 def query_of(text: str | None, file: Path | None) -> str:
     """Return the text of a query, from an argument or from a file."""
-    if (text is None) == (file is None):
+    if text is not None and file is not None:
+        raise typer.BadParameter("expected one of: a query, -f FILE")
+    if text is None and file is None:
         raise typer.BadParameter("add a query as an argument, or a file with -f FILE")
     return text_or_file(text) if text is not None else text_of(file or Path("-"))
 
