@@ -67,6 +67,7 @@ from sgstore.graphs.relations import (
     waypoints_of,
 )
 from sgstore.model.graph import Edges, GraphBlock, LaneStates, LeftOut, StaticPresence, WorldBlock
+from sgstore.model.noise import dead_band
 from sgstore.model.pair_numbers import UNEVEN, all_level
 from sgstore.model.vocabulary import BEYOND, OWN_RELATIONS, RELATION_CODE, RELATIONS
 from sgstore.model.world import States
@@ -795,6 +796,7 @@ class SceneGraphGenerator:
             height=np.where(IS_UPRIGHT[kind] & (height == 0), np.nan, height),
             pitch=np.concatenate([states.pitch[rows], np.full(len(row), np.nan)]),
             carrier=np.concatenate([states.carrier[rows], scenery.carrier[row]]),
+            band=np.append(dead_band(frames.noise, states.derived[rows]), np.zeros(len(row))),
         )
 
 

@@ -5,6 +5,7 @@
     python tools/real_terms.py real            nuScenes and Argoverse 2: stopped, parked, speed, hard braking
     python tools/real_terms.py words [noise]   Euro NCAP and UN R157 runs: each word against its table
     python tools/real_terms.py words table     the table of words and families in docs/noise.md
+    python tools/real_terms.py flicker         runs, recall and precision of terms with noise, per recording
 
 The data are in the folder of shared data (``SGSTORE_DATA``); they are no part of the project.
 ``words noise`` adds σ 0.1 m to all positions and drops every second frame. ``derived``: no velocities.
@@ -38,6 +39,8 @@ DATA = Path(os.environ.get("SGSTORE_DATA") or Path(__file__).parents[2] / "share
 HALF_SECOND = 0.5
 MOVED, STILL, STRAYED = 0.3, 1.0, 3.0
 LEAST_PARKED, PERIOD = 3.0, 0.1
+VEHICLE = 2  # osi3.MovingObject.TYPE_VEHICLE
+LEAST_SEEN = 3
 WORLD = "USING SCOPE world "
 
 
@@ -295,6 +298,103 @@ def braking(store: Store, trace: str, tracks: dict[str, Any]) -> dict[str, float
     return {"hard_brake": len(rows), "of_ego": ego, "impossible": impossible}
 
 
+SIMULATED = (
+    *("esmini/swarm_Town04.mcap", "esmini/highway_merge.mcap", "esmini/traffic_lights.mcap"),
+    *("omega_prime/osi_centerline_example.mcap", "sumo/Town10HD_sumo_osi.mcap"),
+)
+MOTION = ("stopped", "moving", "hard_brake", "accelerating", "turning")
+
+
+def tracks_of_osi(path: Path) -> dict[str, list[tuple[float, ...]]]:
+    """Return time, velocity and heading of each vehicle in a recording of OSI, without sgstore."""
+    pool, view = descriptor_pool.DescriptorPool(), None
+    found: dict[str, list[tuple[float, ...]]] = defaultdict(list)
+    seq = 0
+    with path.open("rb") as read:
+        for schema, _, message in make_reader(read).iter_messages():
+            if schema.name not in {"osi3.SensorView", "osi3.GroundTruth"}:
+                continue
+            if view is None:
+                for file in descriptor_pb2.FileDescriptorSet.FromString(schema.data).file:
+                    pool.Add(file)
+                view = message_factory.GetMessageClass(pool.FindMessageTypeByName(schema.name))
+            content: Any = view.FromString(message.data)
+            truth = getattr(content, "global_ground_truth", content)
+            t = truth.timestamp.seconds + truth.timestamp.nanos / 1e9
+            for one in truth.moving_object:
+                if one.type == VEHICLE:
+                    move, yaw = one.base.velocity, one.base.orientation.yaw
+                    texts = [text for ref in one.source_reference for text in ref.identifier]
+                    names = [text for text in texts if text.startswith("entity_name:")]
+                    ident = (names or [f":{one.id.value}"])[0].partition(":")[2]
+                    row = float(seq), t, float(np.hypot(move.x, move.y)), yaw
+                    found[ident].append(row)
+            seq += 1
+    return found
+
+
+def in_band(enter: Any, stay: Any) -> Any:
+    """Return where a term holds that begins with one condition and goes on with the other."""
+    held, found = False, []
+    for begins, goes_on in zip(enter, stay, strict=True):
+        held = begins or (held and goes_on)
+        found.append(held)
+    return np.array(found, bool)
+
+
+def true_terms(path: Path) -> dict[str, set[tuple[str, int]]]:
+    """Return the frames of each term by its definition, from exact velocities and headings."""
+    found: dict[str, set[tuple[str, int]]] = {name: set() for name in MOTION}
+    for ident, rows in tracks_of_osi(path).items():
+        seq, t, speed, yaw = np.array(rows).T
+        if len(t) < LEAST_SEEN:
+            continue
+        accel, turn = np.gradient(speed, t), np.abs(np.degrees(np.gradient(np.unwrap(yaw), t)))
+        stood = speed <= 0.1
+        holds = {
+            "stopped": stood,
+            "moving": speed > 0.5,
+            "hard_brake": accel <= -3.5,
+            "accelerating": in_band(accel >= 1, accel >= 0.5),
+            "turning": in_band(turn >= 5, turn >= 3),
+        }
+        for name, mask in holds.items():
+            found[name] |= {(ident, int(one)) for one in seq[mask]}
+    return found
+
+
+def runs_of(frames: set[tuple[str, int]]) -> int:
+    """Return the number of runs of consecutive frames, over all bodies."""
+    ordered = sorted(frames)
+    return sum(
+        one[0] != last[0] or one[1] != last[1] + 1
+        for one, last in zip(ordered, [("", -9), *ordered], strict=False)
+    )
+
+
+def flicker(sigmas: tuple[float, ...] = (0.05, 0.1, 0.2, 0.3), out: Any = sys.stdout) -> None:
+    """Print runs, recall and precision of terms in noisy copies of simulator recordings."""
+    print("recording  term  sigma  runs  true runs  recall  precision", file=out)
+    for name in SIMULATED:
+        source = DATA / "traces" / name
+        truth = true_terms(source)
+        for sigma in sigmas:
+            with tempfile.TemporaryDirectory() as place:
+                path = Path(place) / source.name
+                noisy(source, path, sigma, derived=True)
+                with sgstore.open(f"{place}/s.sgstore", create=True) as store:
+                    store.ingest(path, config=sgstore.Config(noise=sigma))
+                    for term in MOTION:
+                        rows = store.find(
+                            f"{WORLD}MATCH (v:Vehicle) WHERE {term}(v) RETURN v.ident, frame.seq"
+                        ).rows()
+                        frames = {(str(ident), int(seq)) for ident, seq in map(tuple, rows)}
+                        both, true = len(frames & truth[term]), truth[term]
+                        told = runs_of(frames), runs_of(true)
+                        shares = [f"{both / max(1, len(of)):.3f}" for of in (true, frames)]
+                        print(source.stem, term, sigma, *told, *shares, sep="  ", file=out)
+
+
 OVERLAPS = "MATCH (e:Ego)-[:overlaps]-(x)"
 WORDS = (
     *("overlaps", "low_ttc", "cut_in", "cut_out", "crossing_pedestrian", "lead_hard_braking"),
@@ -381,6 +481,8 @@ if __name__ == "__main__":
     what = sys.argv[1] if len(sys.argv) > 1 else "real"
     if what == "real":
         real()
+    elif what == "flicker":
+        flicker()
     elif what == "words":
         found = words(0.1 if "noise" in sys.argv else 0.0, derived="derived" in sys.argv)
         if "table" in sys.argv:

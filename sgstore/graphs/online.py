@@ -137,6 +137,8 @@ class Frame:
     topics : dict of str to message
         Messages of other topics at this time: ``{"/planner": {"state": "STOP"}}``. A pattern uses their fields
         as ``topic('/planner').state``. A topic that is absent keeps its last message.
+    noise : float
+        Noise of the positions of entities that a reader has smoothed; m.
     losses : list of (str, str)
         Id and fault of each implausible number, which is treated as missing: ``("7", "length is -4.5 m")``;
         and of each entity without a position.
@@ -149,7 +151,7 @@ class Frame:
     (1, 'hero')
     """
 
-    __slots__ = ("ego", "entities", "events", "losses", "recorded", "time_ns", "topics")
+    __slots__ = ("ego", "entities", "events", "losses", "noise", "recorded", "time_ns", "topics")
 
     def __init__(self, time_ns: int, ego: str | int | None = None) -> None:
         self.time_ns = int(time_ns)
@@ -158,6 +160,7 @@ class Frame:
         self.events: list[tuple[str, str, str]] = []
         self.recorded = frozenset(EVENT_KINDS)
         self.topics: dict[str, Any] = {}
+        self.noise = 0.0
         self.losses: list[tuple[str, str]] = []
 
     def __len__(self) -> int:
@@ -179,7 +182,7 @@ class Frame:
             return self
         frame = Frame(self.time_ns, self.ego)
         frame.events, frame.recorded, frame.losses = self.events, self.recorded, self.losses
-        frame.topics = self.topics
+        frame.topics, frame.noise = self.topics, self.noise
         frame.entities = [
             entity.meant(types.get(entity.type_name.lower())) for entity in self.entities
         ]
@@ -356,7 +359,8 @@ class Frame:
             told |= {"kind": KINDS[entity.kind], "static": entity.static, "whole": [*entity.whole]}
             told["numbers"] = [None if math.isnan(one) else one for one in entity.numbers]
             entities.append(told | ({"own": dict(entity.own)} if entity.own else {}))
-        told = {"time_ns": self.time_ns, "ego": self.ego, "entities": entities}
+        told: dict[str, Any] = {"time_ns": self.time_ns, "ego": self.ego, "entities": entities}
+        told |= {"noise": self.noise} if self.noise else {}
         return told | {"events": [*map(list, self.events)], "recorded": sorted(self.recorded)}
 
     @classmethod
@@ -379,6 +383,7 @@ class Frame:
         """
         frame = cls(int(told["time_ns"]), str(told["ego"]))
         frame.recorded = frozenset(map(str, told["recorded"]))
+        frame.noise = float(told.get("noise", 0.0))
         for event in told["events"]:
             frame.happened(*map(str, event))
         for one in told["entities"]:
@@ -525,7 +530,7 @@ class Replay:
                 order = np.argsort(nodes, kind="stable").tolist()
                 there = [(*standing, *there)[i] for i in order]
                 standing = []
-            frame.entities = there
+            frame.entities, frame.noise = there, block.noise
             yield frame
 
     def _entities(self, states: States, start: int, stop: int) -> list[Entity]:
@@ -988,6 +993,7 @@ class Stepper:
             entities=entities_of(first, new),
             scenery=self._states(standing),
             messages=MessageRefs(none, none, none, none, none),
+            noise=frame.noise,
         )
 
     def _kept(self, block: FrameBlock) -> FrameBlock:

@@ -485,6 +485,63 @@ class Smoother(GapFiller):
         return result
 
 
+PLACE: Final = 3.0
+"""Dead band of a noisy place for lanes, in units of the noise."""
+
+
+def dead_band(noise: float, derived: Ints) -> Floats:
+    """Return the half width of the dead band of places, from bits ``derived``: (n,); m. 0: exact."""
+    return PLACE * noise * (derived & SMOOTHED > 0)
+
+
+class DeadBand:
+    """Places of noisy bodies that follow only moves beyond a dead band.
+
+    Each returned place is within the band of the position. A lane therefore does not change by noise.
+    """
+
+    MOST: Final = 20_000
+    """Number of bodies that are remembered."""
+
+    def __init__(self) -> None:
+        # Node → last position, and its distance from the returned place along and across the heading.
+        self._last: dict[int, tuple[float, ...]] = {}
+
+    def held(self, node: Ints, frame: Ints, place: Floats, heading: Floats, band: Floats) -> Floats:
+        """Return the held places of bodies.
+
+        Parameters
+        ----------
+        node, frame : (n,) int64
+        place : (n, 2) float64
+            Positions; m.
+        heading : (n,) float64
+            rad
+        band : (n,) float64
+            Half width of the dead band along and across the heading; m. 0: the position is exact.
+        """
+        found = place.copy()
+        noisy = np.flatnonzero((band > 0) & np.isfinite(place).all(axis=1))
+        for number in np.unique(frame[noisy]):
+            at = noisy[frame[noisy] == number]
+            ids = node[at].tolist()
+            last = np.array(
+                [self._last.pop(one, (np.nan,) * 4) for one in ids], np.float64
+            ).reshape(-1, 4)
+            cos, sin = np.cos(heading[at]), np.sin(heading[at])
+            x, y = (place[at] - last[:, :2]).T
+            moved = np.stack([x * cos + y * sin, y * cos - x * sin], axis=1)
+            apart = np.nan_to_num(last[:, 2:] + moved)
+            apart = np.clip(apart, -band[at, None], band[at, None])
+            found[at, 0] -= apart[:, 0] * cos - apart[:, 1] * sin
+            found[at, 1] -= apart[:, 0] * sin + apart[:, 1] * cos
+            rows = np.column_stack([place[at], apart]).tolist()
+            self._last.update(zip(ids, map(tuple, rows), strict=True))
+        while len(self._last) > self.MOST:
+            del self._last[next(iter(self._last))]
+        return found
+
+
 def noise_of(node: Ints, frame: Ints, seconds: Floats, values: Floats, fixed: Bools) -> Noise:
     """Estimate the noise of positions. See :meth:`Smoother.fill` for the parameters.
 

@@ -147,7 +147,7 @@ class OnlineSmoother(GapFiller):
                 own[row] = {**(own[row] or {}), **one}
         columns = {name: filled[:, i] for i, name in enumerate(POSE)}
         moved = replace(states, derived=states.derived | derived, own=own, **columns)
-        return replace(block, states=moved)
+        return replace(block, states=moved, noise=max(self.noise))
 
     def _step(self, node: Ints, seconds: float, place: Floats) -> tuple[Floats, Bools]:
         """Return velocity, acceleration and yaw rate of the next frame's bodies, and a mask: which stand."""

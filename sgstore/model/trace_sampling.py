@@ -202,6 +202,7 @@ def _joined(blocks: list[FrameBlock]) -> FrameBlock:
         scenery=chained([block.scenery for block in blocks]),
         messages=chained([block.messages for block in blocks]),
         events=tuple(event for block in blocks for event in block.events),
+        noise=first.noise,
     )
 
 

@@ -610,6 +610,8 @@ class FrameBlock:
         The messages read with this block, of all channels that are not latched.
     events : tuple of Event
         Events read with this block. They belong to its frames, and possibly to later frames.
+    noise : float
+        Noise of the positions of smoothed states; m.
     """
 
     seq: Ints
@@ -622,6 +624,7 @@ class FrameBlock:
     scenery: States
     messages: MessageRefs
     events: tuple[Event, ...] = ()
+    noise: float = 0.0
 
     def __post_init__(self) -> None:
         frames = len(self.seq)

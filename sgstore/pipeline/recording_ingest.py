@@ -228,9 +228,12 @@ class TraceTally:
         Simulation times of the frames, 8 bytes each; ns.
     checked : Plausibility
         Check for implausible data.
+    noise : float
+        Noise of the positions; m.
     """
 
     frames: int = 0
+    noise: float = 0.0
     kinds: Counter[int] = field(default_factory=Counter[int])
     times: array[int] = field(default_factory=lambda: array("q"))
     checked: Plausibility = field(default_factory=Plausibility)
@@ -238,6 +241,7 @@ class TraceTally:
     def see(self, frames: FrameBlock) -> None:
         """Add a block of frames to the counts of the trace."""
         self.frames += len(frames)
+        self.noise = frames.noise
         self.kinds.update(frames.entities.kind.tolist())
         self.times.frombytes(frames.time_ns.astype(np.int64).tobytes())
         self.checked.see(frames)
@@ -262,16 +266,18 @@ class TraceTally:
         Returns
         -------
         dict
-            ``entities``; ``clock_jumps``: number of backward steps of the clock; ``gaps``: number of steps
-            longer than 2.5 median periods; ``clock_jumps_at``, ``gaps_at``: the first ones, each with the
-            number of the frame after the step (``seq``), its time since the start of the trace (``t``), and the
-            step (``seconds``).
+            ``entities``; ``noise`` of the positions, if not 0 (m); ``clock_jumps``: number of backward steps of
+            the clock; ``gaps``: number of steps longer than 2.5 median periods; ``clock_jumps_at``,
+            ``gaps_at``: the first ones, each with the number of the frame after the step (``seq``), its time
+            since the start of the trace (``t``), and the step (``seconds``).
         """
         times = np.frombuffer(self.times, np.int64)
         steps = np.diff(times)
         forward = steps[steps > 0]
         period = float(np.median(forward)) if len(forward) else 0.0
         report: dict[str, Any] = {"entities": self.entities}
+        if self.noise:
+            report["noise"] = self.noise
         longest = longest_step_ns(int(max(period, 1)))
         for name, found in (("clock_jumps", steps < 0), ("gaps", steps > longest)):
             rows = np.flatnonzero(found)

@@ -745,6 +745,7 @@ def _block(
         scenery=scenery,
         messages=chained(refs),
         events=roster.take_events(),
+        noise=max(smoother.noise) if smoother is not None else 0.0,
     )
 
 

@@ -402,8 +402,11 @@ class _StateReader:
     def __init__(self, connection: DuckDBPyConnection, trace_id: int) -> None:
         self._connection = connection
         (row,) = connection.execute(
-            "SELECT origin_x, origin_y, origin_z, frames FROM trace WHERE trace_id = ?", [trace_id]
+            "SELECT origin_x, origin_y, origin_z, frames, coalesce(CAST(report->>'noise' AS DOUBLE), 0)"
+            " FROM trace WHERE trace_id = ?",
+            [trace_id],
         ).fetchall()
+        self._noise = row[4]
         self._origin = Origin(*row[:3])
         self._low = trace_id << frame_ids.BUCKET_BITS
         self._high = self._low + -(-row[3] // BUCKET_FRAMES)
@@ -446,6 +449,7 @@ class _StateReader:
             entities=entities,
             scenery=scenery,
             messages=MessageRefs(none, none, none, none, none),
+            noise=self._noise,
         )
 
     def _introduced(self, rows: slice) -> tuple[Entities, States]:

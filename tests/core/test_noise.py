@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from real_terms import noisy
 from recordings import Recorder, car
 
 import sgstore
 from sgstore import Frame
 from sgstore.graphs.online import NUMBERS, Replay
+from sgstore.graphs.relations import _crowds
+from sgstore.lang.library import patterns
+from sgstore.model.config import from_dict
+from sgstore.model.noise import DeadBand
 from sgstore.model.world import STANDS
+from sgstore.pipeline.derive import derive
 from sgstore.readers import open_trace
 from sgstore.temporal import opened
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -421,3 +429,85 @@ def test_wrong_bounds_name_their_cause(open_town: Store, condition: str, words: 
         open_town.find(f"MATCH (e:Ego) WHERE {condition}")
     with pytest.raises(sgstore.QueryError, match="ends at the frame"):
         open_town.check("CHECK ALWAYS min_over(ego.speed, -1s..1s) >= 0")
+
+
+def test_a_held_place_follows_only_moves_beyond_its_band() -> None:
+    """Against the definition, one body and one axis at a time."""
+    rng = np.random.default_rng(4)
+    frames, bodies, turn = 80, 3, 0.4
+    frame, node = np.repeat(np.arange(frames), bodies), np.tile(np.arange(bodies), frames)
+    true = np.outer(frames_of := np.arange(frames) * PERIOD, [8, 0]).repeat(bodies, axis=0)
+    true[node == 1] = 0  # it stands
+    noise = rng.normal(0, 0.1, true.shape)
+    band = np.where(node == 2, 0.0, 0.3)
+    axes = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    place = (true + noise) @ axes  # x along the heading
+    held = DeadBand().held(node, frame, place, np.full(len(node), turn), band)
+    assert len(frames_of) == frames
+    for one in range(bodies):
+        mine = node == one
+        for axis in (0, 1):
+            want, at = [], None
+            for value in (place[mine] @ axes.T)[:, axis]:
+                at = (
+                    value
+                    if at is None
+                    else np.clip(at, value - band[mine][0], value + band[mine][0])
+                )
+                want.append(at)
+            np.testing.assert_allclose((held[mine] @ axes.T)[:, axis], want, atol=1e-9)
+    np.testing.assert_array_equal(held[node == 2], place[node == 2])
+    again = DeadBand()
+    parts = [
+        again.held(node[at], frame[at] - start, place[at], np.full(at.sum(), turn), band[at])
+        for start in range(0, frames, 7)
+        for at in [(frame >= start) & (frame < start + 7)]
+    ]
+    np.testing.assert_array_equal(np.concatenate(parts), held)
+
+
+LANES = "MATCH (v:Vehicle)-[:isIn {primary: TRUE}]->(l:Lane) RETURN v.ident, frame.seq, l.id"
+
+
+def lane_changes(rows: Iterable[tuple[Any, ...]]) -> int:
+    """Number of changes of the primary lane to another number of the lane, over all vehicles."""
+    lanes: dict[str, list[tuple[int, Any]]] = {}
+    for ident, seq, lane in sorted(map(tuple, rows)):
+        lanes.setdefault(ident, []).append((seq, lane))
+    return sum(a != b for one in lanes.values() for (_, a), (_, b) in pairwise(one))
+
+
+def test_noise_changes_no_lanes(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a store, after other settings, in small parts, and in a monitor."""
+    source = data / "traces/esmini/cut-in.mcap"
+    path = tmp_path / "noisy.mcap"
+    noisy(source, path, 0.3, derived=True, seed=1)
+    config, wide = sgstore.Config(noise=0.3), from_dict({"noise": 0.3, "range": {"radius": 90}})
+    found: dict[str, Any] = {}
+    for name, recording, how in (
+        ("exact", source, sgstore.Config()),
+        ("noisy", path, config),
+        ("wide", path, wide),
+    ):
+        with sgstore.open(tmp_path / f"{name}.sgstore", create=True) as store:
+            store.ingest(recording, config=how)
+            found[name] = set(map(tuple, store.find(LANES).rows()))
+    assert lane_changes(found["noisy"]) == lane_changes(found["exact"]) > 0
+    derive(tmp_path / "noisy.sgstore", wide, "wide")
+    with sgstore.open(tmp_path / "noisy.sgstore") as store:
+        told = store.find(f"USING ABSTRACTION wide {LANES}").rows()
+        assert set(map(tuple, told)) == found["wide"]
+    monkeypatch.setattr(_crowds, "AT_ONCE", 40)
+    with sgstore.open(tmp_path / "parts.sgstore", create=True) as store:
+        store.ingest(path, config=config)
+        assert set(map(tuple, store.find(LANES).rows())) == found["noisy"]
+    query = patterns()["changes_lane_left"].written(), patterns()["changes_lane_right"].written()
+    counts = []
+    for recording, how in ((source, sgstore.Config()), (path, config)):
+        with opened(str(recording), how) as replay:
+            monitor = sgstore.Monitor(";".join(query), replay.road_map, how)
+            events = [event for frame in replay.frames for event in monitor.step(frame)]
+            counts.append(len([*events, *monitor.finish()]))
+    assert counts[0] == counts[1] > 0

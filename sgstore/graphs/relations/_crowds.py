@@ -105,7 +105,8 @@ def _part(frames: FrameBlock, start: int, stop: int) -> FrameBlock:
         first_new = entities.first + len(entities)
         entities = replace(taken(entities, none), first=first_new)
         scenery, messages, events = scenery.take(none), taken(messages, none), ()
-    return type(frames)(
+    return replace(
+        frames,
         seq=frames.seq[start:stop],
         time_ns=frames.time_ns[start:stop],
         log_time_ns=frames.log_time_ns[start:stop],

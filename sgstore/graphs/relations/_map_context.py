@@ -24,6 +24,7 @@ from sgstore.graphs.relations._scene import (
 )
 from sgstore.graphs.relations._signal_reach import SignalReach
 from sgstore.maps.roads import OFF_ROAD, LaneHits, RoadMap
+from sgstore.model.noise import DeadBand
 from sgstore.model.vocabulary import DRIVING, RELATION_CODE, VEHICLES, are_entities
 
 if TYPE_CHECKING:
@@ -247,6 +248,7 @@ class _Footing:
         self._lines = lines
         self._node: Ints = np.zeros(0, np.int64)
         self._box = np.zeros((0, 6))
+        self._held = DeadBand()
         self._lanes, self._crosswalks = self._ask(np.zeros(0, np.intp), self._box)
 
     def of(self, bodies: Bodies) -> tuple[LaneHits, Floats, tuple[Ints, Ints]]:
@@ -255,7 +257,11 @@ class _Footing:
         known = len(self._node)
         node = np.concatenate([self._node, bodies.node[rows]])
         frame = np.concatenate([np.full(known, -1), bodies.frame[rows]])
-        box = np.concatenate([self._box, np.column_stack([bodies.boxes, bodies.bottom])[rows]])
+        new = np.column_stack([bodies.boxes, bodies.bottom])[rows]
+        if bodies.band[rows].any():
+            sides = bodies.node[rows], bodies.frame[rows], new[:, :2], new[:, 2], bodies.band[rows]
+            new[:, :2] = self._held.held(*sides)
+        box = np.concatenate([self._box, new])
         same_as, last = _runs(node, frame, box)
         ask = np.flatnonzero(same_as[known:] == np.arange(known, len(node))) + known
         tables = [

@@ -113,6 +113,8 @@ class Bodies:
         The box; m, m, m, rad, m, m, m. A zero height of an upright kind is missing.
     carrier : int64
         Node id of its carrier or tractor; negative for none.
+    band : float64
+        Half width of the dead band of noisy positions; m. 0: exact.
     """
 
     frame: Ints
@@ -128,6 +130,7 @@ class Bodies:
     height: Floats
     pitch: Floats
     carrier: Ints
+    band: Floats
 
     def __len__(self) -> int:
         return len(self.node)
