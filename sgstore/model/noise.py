@@ -491,7 +491,7 @@ PLACE: Final = 3.0
 
 def dead_band(noise: float, derived: Ints) -> Floats:
     """Return the half width of the dead band of places, from bits ``derived``: (n,); m. 0: exact."""
-    return PLACE * noise * (derived & SMOOTHED > 0)
+    return np.where(derived & SMOOTHED > 0, PLACE * noise, 0.0)
 
 
 class DeadBand:

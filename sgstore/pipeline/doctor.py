@@ -43,6 +43,8 @@ class Examination:
     frames, states : int
     seconds : float
         Time from the first to the last frame; s.
+    noise : float
+        Noise of the positions; m. 0: exact.
     entities : dict
         Number of entities by kind.
     unknown_types : dict
@@ -72,6 +74,7 @@ class Examination:
     frames: int = 0
     states: int = 0
     seconds: float = 0.0
+    noise: float = 0.0
     entities: dict[str, int] = field(default_factory=dict[str, int])
     unknown_types: dict[str, int] = field(default_factory=dict[str, int])
     clock_jumps: int = 0
@@ -159,6 +162,7 @@ def _read(found: Examination, config: Config, maps: Maps, counts: Counter[int]) 
         used, odd = maps.of(info)
         found.road_map = used.name if used else ""
         on_map(trace, used)
+        trace.noise = config.noise
         tally = TraceTally(checked=Plausibility(used))
         try:
             for block in trace.blocks(2 * BUCKET_FRAMES):

@@ -19,6 +19,7 @@ from sgstore.model.config import from_dict
 from sgstore.model.noise import DeadBand
 from sgstore.model.world import STANDS
 from sgstore.pipeline.derive import derive
+from sgstore.pipeline.doctor import examine
 from sgstore.readers import open_trace
 from sgstore.temporal import opened
 
@@ -247,6 +248,13 @@ def test_recorded_motion_is_kept_beside_motion_from_positions(tmp_path: Path) ->
         ).rows()
         assert row.v == 5.0
         assert abs(row.p - 12) < 0.5
+
+
+def test_an_examination_has_the_noise_of_an_ingest(tmp_path: Path) -> None:
+    _, path = recorded(tmp_path / "a.mcap", 0.1)
+    assert 0.05 < examine(path).noise < 0.2
+    assert examine(path, config=sgstore.Config(noise=0.3)).noise == 0.3
+    assert examine(path, config=sgstore.Config(noise=0.0)).noise == 0
 
 
 def test_noise_can_be_set(tmp_path: Path) -> None:
