@@ -104,8 +104,8 @@ def row_words(columns: Mapping[str, NDArray[Any] | None]) -> Words:
 
 
 def _mask_of(values: NDArray[Any]) -> NDArray[np.bool_] | None:
-    mask = np.ma.getmask(values)
-    return None if mask is np.ma.nomask else mask
+    known = np.ma.getmask(values) is np.ma.nomask
+    return None if known else np.ma.getmaskarray(values)
 
 
 def _mix(words: Words, spare: Words) -> None:

@@ -8,15 +8,19 @@ import math
 import re
 import sys
 from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from graph_blocks import RandomTrace, publish
 
 from sgstore.apps.cli import run
 from sgstore.errors import ConfigError
 from sgstore.pipeline.importing import import_graphs
+from sgstore.query import Store
+from sgstore.store import StoreFile
 from sgstore.testsets.coverage import ChosenFrames, frames_of, selection_of
 from sgstore.testsets.locks import cases_of, read_lock
 from sgstore.testsets.selection import (
@@ -32,11 +36,10 @@ from sgstore.testsets.selection import (
     units_of,
 )
 from sgstore.testsets.selection._learn import features_of, fitted
+from sgstore.testsets.selection._near_pairs import worst_in_frames
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
-
-    from sgstore.query import Store
 
 pytestmark = pytest.mark.seconds(13)
 
@@ -64,6 +67,34 @@ def worst_by_hand(some: ChosenFrames, name: str, low: bool = True) -> dict[int, 
             if value < best if low else value > best:
                 found[frame] = value, other
     return found
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_values_within_bounds_are_those_of_all_pairs(tmp_path: Path, seed: int) -> None:
+    store = StoreFile.create(tmp_path / "s.db")
+    for trace in range(2):
+        publish(store, RandomTrace(10 * seed + trace, frames=70, path=f"{trace}"))
+    assert_worst_as_by_hand(ChosenFrames("random", Store(store.path), None))
+
+
+def test_values_within_bounds_are_those_of_a_town(some: ChosenFrames) -> None:
+    assert_worst_as_by_hand(some)
+
+
+def assert_worst_as_by_hand(chosen: ChosenFrames) -> None:
+    units = units_of(chosen, SelectionUnit.frame, 2.0, None)
+    names = ("closing_time", "ttc_mild")
+    values, others, blind = worst_in_frames(chosen.store.file, units.frame_id, names)
+
+    for name, value, other in zip(names, values, others, strict=True):
+        wanted = worst_by_hand(replace(chosen, frame_id=units.frame_id), name)
+        known = np.flatnonzero(value < np.inf)
+        found = zip(value[known].tolist(), other[known].tolist(), strict=True)
+        assert dict(zip(units.frame_id[known].tolist(), found, strict=True)) == wanted
+        assert wanted
+    among = f"{OTHERS} AND frame_id IN (SELECT unnest(?))"
+    sql = f"SELECT count(*) - count(gap) FROM world_criticality WHERE {among}"
+    assert blind.sum() == chosen.store.file.rows(sql, [units.frame_id.tolist()]).values[0][0]
 
 
 def ranks(values: list[float]) -> list[int]:

@@ -46,6 +46,14 @@ class PairNumbers(dict[str, "Floats"]):
                 {f"{one}_{name}": told.get(name, unknown) for name in (*COLUMNS, *OPTIONAL)}
             )
 
+    @classmethod
+    def of(cls, a: Mapping[str, Floats], b: Mapping[str, Floats]) -> PairNumbers:
+        """Return the measures of pairs, from columns of the two entities by name."""
+        found = cls.__new__(cls)
+        for one, columns in (("a", a), ("b", b)):
+            found.update({f"{one}_{name}": values for name, values in columns.items()})
+        return found
+
     def __missing__(self, name: str) -> Floats:
         with np.errstate(all="ignore"):
             found = self[name] = _compiled(name)(self)

@@ -35,6 +35,11 @@ from sgstore.testsets.selection._learn import (
     learned_elsewhere,
     model_name,
 )
+from sgstore.testsets.selection._near_pairs import (
+    BOUNDED,
+    FRAMES,
+    worst_in_frames,
+)
 from sgstore.testsets.selection._situations import (
     MET,
     OTHERS,
@@ -513,6 +518,34 @@ def _worst_of_pairs(
 ) -> dict[str, WorstValues]:
     if not measures:
         return {}
+    if told is None and BOUNDED.issuperset(measures):
+        value, other, blind = _worst_within_bounds(units, measures)
+    else:
+        value, other, blind = _worst_of_all_pairs(units, measures, told)
+    return {
+        name: replace(_worst_of(units, name, value[i], other[i]), blind=blind)
+        for i, name in enumerate(measures)
+    }
+
+
+def _worst_within_bounds(units: Units, measures: Sequence[str]) -> tuple[Floats, Ints, int]:
+    """Return signed values, entities and blind pairs as :func:`_worst_of_all_pairs` does."""
+    value = np.full((len(measures), len(units.frame_id)), np.inf)
+    other = np.full(value.shape, -1)
+    blind = 0
+    for start, part in frames_in_parts(units.frame_id, FRAMES):
+        here = slice(start, start + len(part))
+        found = worst_in_frames(units.chosen.one_store.file, part, measures)
+        value[:, here], other[:, here], unknown = found
+        blind += int(unknown[units.asked[here]].sum())
+    value[:, ~units.asked], other[:, ~units.asked] = np.inf, -1
+    return value, other, blind
+
+
+def _worst_of_all_pairs(
+    units: Units, measures: Sequence[str], told: Situations | None
+) -> tuple[Floats, Ints, int]:
+    """Return signed values and entities for each measure and frame, and the number of pairs without a gap."""
     columns = ["frame_id"]
     for i, name in enumerate(measures):
         column = RANKED[name].column or name
@@ -548,10 +581,7 @@ def _worst_of_pairs(
                 column = np.ma.asarray(found[f"{name}{i}"])[here]
                 known = ~np.ma.getmaskarray(column)
                 all_of[i, start + at[here][known]] = np.ma.getdata(column)[known]
-    return {
-        name: replace(_worst_of(units, name, value[i], other[i].astype(np.int64)), blind=blind)
-        for i, name in enumerate(measures)
-    }
+    return value, other.astype(np.int64), blind
 
 
 def _worst_of(units: Units, name: str, frames: Floats, who: Ints) -> WorstValues:

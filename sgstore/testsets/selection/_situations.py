@@ -52,10 +52,10 @@ _SQL: Final = f"""
 """  # noqa: S608  names of ours
 
 
-def frames_in_parts(frames: Ints) -> Iterator[tuple[int, Ints]]:
+def frames_in_parts(frames: Ints, size: int = _FRAMES) -> Iterator[tuple[int, Ints]]:
     """Yield groups of ascending frame ids, each with the index of its first frame."""
-    for start in range(0, len(frames), _FRAMES):
-        yield start, frames[start : start + _FRAMES]
+    for start in range(0, len(frames), size):
+        yield start, frames[start : start + size]
 
 
 def situations(units: Units, rows: Ints) -> tuple[Ints, list[str]]:
