@@ -259,3 +259,44 @@ def test_an_error_is_shown_once(page: Any) -> None:
     expect(page.get_by_role("alert")).to_contain_text("The server does not answer")
     expect(page.locator(".status .error")).to_have_text("not answered yet")
     assert page.get_by_text("The server does not answer").count() == 1
+
+
+ASIDE: Final = """async () => {
+  const load = name => import(new URL(`static/js/${name}.js`, document.baseURI));
+  const {kindOf} = await load("data"), {lightsAside} = await load("draw");
+  const light = [...Array(100).keys()].find(code => kindOf(code) === "traffic_light");
+  const columns = {kind: [light, light, light, light], x: [0, 0.1, 0.2, 40], y: [0, 0.1, 0, 0]};
+  const look = {x: 0, y: 0, turn: 1, scale: 10, width: 900, height: 700};
+  return [...lightsAside(columns, 0, 4, look).values()];
+}"""
+"""How far lights at nearly one place stand aside, and one that is far away."""
+
+
+def test_no_traffic_light_covers_another(page: Any) -> None:
+    first, second, third, far = page.evaluate(ASIDE)
+
+    assert first == far == 0
+    assert second > 0.9  # the width of a light; m
+    assert third > second + 0.9
+
+
+def test_a_traffic_light_has_a_state_and_no_speed(page: Any) -> None:
+    search(page, "MATCH (e:Ego)-[:near]->(t:TrafficLight)")
+    open_first(page)
+    page.get_by_role("tab", name="nodes").click()
+    page.get_by_role("row").filter(has_text="traffic_light").first.click()
+
+    panel = page.locator(".panel.pattern")
+    expect(panel.locator("td", has_text="light").first).to_have_text("light")
+    expect(panel.get_by_role("button", name="speed", exact=True)).to_have_count(0)
+
+
+def test_a_label_of_the_pattern_lies_between_its_nodes(page: Any) -> None:
+    search(page, "MATCH (t:TrafficLight)-[:controlsTrafficOf]->(l:Lane)")
+    open_first(page)
+    label = page.locator(".drawn text.halo").bounding_box()
+    nodes = [one.bounding_box() for one in page.locator(".drawn rect").all()]
+
+    left, right = sorted(nodes, key=lambda one: one["x"])
+    assert left["x"] + left["width"] < label["x"]
+    assert label["x"] + label["width"] < right["x"]

@@ -164,13 +164,35 @@ function paintRings(ctx, states, look, ratio, ink) {
   ctx.globalAlpha = 1;
 }
 
+/** Width and height of a traffic light; m. @param {number} scale */
+const lightSize = (scale) => [Math.max(2.6, 20 / scale) * 0.46, Math.max(2.6, 20 / scale)];
+
+/** How far the traffic lights of a frame stand aside, so that none covers another: row → m to the right.
+ * @param {Columns} c @param {number} from @param {number} to @param {Look} look */
+export function lightsAside(c, from, to, look) {
+  const [wide = 0, high = 0] = lightSize(look.scale), place = axes(look), aside = new Map();
+  /** @type {[number, number][]} */
+  const taken = [];
+  for (let i = from; i < to; i++) {
+    if (kindOf(c.kind[i]) !== "traffic_light") continue;
+    const { x, y } = place.transformPoint({ x: c.x[i], y: c.y[i] });
+    let right = 0;
+    while (taken.some(([u, v]) => Math.abs(u - x - right * look.scale) < wide * look.scale
+      && Math.abs(v - y) < high * look.scale)) right += wide * 1.1;
+    taken.push([x + right * look.scale, y]);
+    aside.set(i, right);
+  }
+  return aside;
+}
+
 /** A traffic light as its housing with three lamps, upright on the screen. @param {CanvasRenderingContext2D} ctx
  * @param {string} state
- * @param {number} scale @param {number} turn back to upright */
-function paintLight(ctx, state, scale, turn) {
-  const high = Math.max(2.6, 20 / scale), wide = high * 0.46, lamps = ["green", "yellow", "red"];
+ * @param {number} scale @param {number} turn back to upright @param {number} aside m to the right on the screen */
+function paintLight(ctx, state, scale, turn, aside) {
+  const [wide, high] = lightSize(scale), lamps = ["green", "yellow", "red"];
   const on = state === "red_yellow" ? ["red", "yellow"] : state === "flashing" ? ["yellow"] : [state];
   ctx.rotate(turn);
+  ctx.translate(aside, 0);
   ctx.fillStyle = "#20262e";
   ctx.beginPath();
   ctx.roundRect(-wide / 2, -high / 2, wide, high, wide * 0.3);
@@ -213,8 +235,8 @@ export function legendOf(trace, states) {
 
 /** @param {CanvasRenderingContext2D} ctx @param {Columns} c @param {number} i @param {number} scale
  * @param {Inks} ink @param {{marked: Set<number>, lit: Set<number>, chosen?: number | null, small?: boolean}} what
- * @param {number} turn */
-function paintEntity(ctx, c, i, scale, ink, what, turn) {
+ * @param {number} turn @param {number} aside of a traffic light */
+function paintEntity(ctx, c, i, scale, ink, what, turn, aside) {
   const kind = kindOf(c.kind[i]), node = c.node[i], ego = c.ego ? c.ego[i] : 0;
   const least = (what.marked.has(node) ? 7 : 3.5) / scale;
   const length = Math.max(c.length[i] || 0.5, least), width = Math.max(c.width[i] || 0.5, least * 0.7);
@@ -226,7 +248,8 @@ function paintEntity(ctx, c, i, scale, ink, what, turn) {
   if (kind === "traffic_light") ctx.fillStyle = LIGHTS[lightOf(c.light?.[i] ?? 0)] || ink.faint;
   if (SCENERY.has(kind)) ctx.globalAlpha = 0.55;
   const glyph = kind === "traffic_light" && !what.small;
-  if (glyph) paintLight(ctx, lightOf(c.light?.[i] ?? 0), scale, -heading - turn); else ctx.beginPath();
+  if (glyph) paintLight(ctx, lightOf(c.light?.[i] ?? 0), scale, -heading - turn, aside);
+  else ctx.beginPath();
   if (glyph) { /* painted */ } else if (kind === "person" || kind === "traffic_light" || kind === "pole") {
     ctx.arc(0, 0, Math.max(length, width) / 2, 0, 7);
   } else {
@@ -308,9 +331,10 @@ export function paintScene(ctx, trace, states, look, ratio, what) {
   for (const [c, from, to] of [[still, 0, still?.node?.length || 0],
     [states?.columns, states?.from || 0, states?.to || 0]]) {
     if (!c) continue;
+    const aside = what.small ? null : lightsAside(c, from, to, look);
     for (let i = from; i < to; i++) {
       if (Math.abs(c.x[i] - look.x) > reach || Math.abs(c.y[i] - look.y) > reach) continue;
-      paintEntity(ctx, c, i, look.scale, ink, what, look.turn);
+      paintEntity(ctx, c, i, look.scale, ink, what, look.turn, aside?.get(i) || 0);
     }
   }
   if (what.track && what.track.length > 1) {
@@ -414,9 +438,11 @@ export function lookAt(trace, states, nodes, width, height, most = 70) {
  * @param {number} py */
 export function nodeAt(states, look, px, py) {
   const { x, y } = axes(look).inverse().transformPoint({ x: px, y: py }), c = states.columns;
+  const lights = lightsAside(c, states.from, states.to, look), cos = Math.cos(look.turn), sin = Math.sin(look.turn);
   let best = -1, away = 8 / look.scale;
   for (let i = states.from; i < states.to; i++) {
-    const far = Math.hypot(c.x[i] - x, c.y[i] - y) - Math.max(c.length[i] || 0, 1) / 2;
+    const aside = lights.get(i) || 0;
+    const far = Math.hypot(c.x[i] + aside * cos - x, c.y[i] - aside * sin - y) - Math.max(c.length[i] || 0, 1) / 2;
     if (far < away) { best = c.node[i]; away = far; }
   }
   return best;

@@ -7,7 +7,8 @@ import { lit, open } from "./state.js";
 const html = htm.bind(h);
 
 /** Places of nodes, the same for the same pattern: paths on a line, from end to end; anything else on a circle.
- * @param {string[]} keys @param {{src: string, dst: string}[]} edges */
+ * On a line the nodes are so far apart that the longest label fits between them.
+ * @param {string[]} keys @param {{src: string, dst: string, label: string}[]} edges */
 function places(keys, edges) {
   const near = new Map(keys.map((key) => [key, new Set()]));
   for (const { src, dst } of edges) if (src !== dst) { near.get(src)?.add(dst); near.get(dst)?.add(src); }
@@ -24,12 +25,13 @@ function places(keys, edges) {
   }
   const pairs = new Set(edges.map(({ src, dst }) => [src, dst].sort().join())).size;
   straight &&= pairs < Math.max(order.length, 2);
-  const width = straight ? 76 + (order.length - 1) * 138 : 360;
+  const step = Math.max(138, ...edges.map(({ label }) => 78 + 6 * label.length));
+  const width = straight ? 76 + (order.length - 1) * step : 360;
   /** @type {Map<string, [number, number]>} */
   const found = new Map();
   order.forEach((key, i) => {
     const angle = (i / order.length) * 2 * Math.PI - Math.PI / 2;
-    found.set(key, straight ? [38 + i * 138, 52] : [180 + 136 * Math.cos(angle), 92 + 68 * Math.sin(angle)]);
+    found.set(key, straight ? [38 + i * step, 52] : [180 + 136 * Math.cos(angle), 92 + 68 * Math.sin(angle)]);
   });
   return { found, width: Math.max(width, 214), height: straight ? 92 : 186 };
 }

@@ -222,7 +222,9 @@ function NodePanel() {
   const now = open.value, node = chosen.value, states = now ? statesAt(now.trace, frame.value) : null;
   if (!now || node === null) return null;
   const row = states ? rowOf(states, node) : -1, c = states?.columns, ego = states ? egoRow(states) : -1;
-  const about = row < 0 || !c ? [] : [["speed", `${c.speed[row].toFixed(2)} m/s`],
+  const light = row >= 0 && c && kindOf(c.kind[row]) === "traffic_light";
+  const about = row < 0 || !c ? [] : [light ? ["light", lightOf(c.light?.[row] ?? 0)]
+    : ["speed", `${c.speed[row].toFixed(2)} m/s`],
     ["heading", `${((c.heading[row] * 180) / Math.PI).toFixed(1)}°`],
     ["size", `${c.length[row].toFixed(1)} × ${c.width[row].toFixed(1)} m`],
       ["place", `${placeOf(now.trace, c, row).map((v) => v.toFixed(2)).join(", ")} m`]];
@@ -233,8 +235,8 @@ function NodePanel() {
     <table><tbody>${about.map(([name, value]) => html`<tr><td class="faint">${name}</td><td>${value}</td>
       </tr>`)}</tbody></table>
     ${offline.value && !live.value ? null : html`<div class="row wrap" style=${{ marginTop: "8px" }}>
-      ${Object.entries(OF_NODE).map(([name, unit]) => html`<button class="small" aria-pressed=${has(name, node)}
-        onClick=${() => showSeries(name, unit, node)}>${name}</button>`)}
+      ${light ? null : Object.entries(OF_NODE).map(([name, unit]) => html`<button class="small"
+        aria-pressed=${has(name, node)} onClick=${() => showSeries(name, unit, node)}>${name}</button>`)}
       ${other === undefined ? null : Object.entries(PAIRS).map(([name, unit]) => html`<button class="small"
         aria-pressed=${has(name, other)} onClick=${() => showSeries(name, unit, other, node)}>
         ${name} from ego</button>`)}
@@ -249,7 +251,10 @@ function NodePanel() {
 function choose(node) {
   chosen.value = node;
   panel.value = "node";
-  showSeries("speed", "m/s", node, undefined, true);
+  const states = open.value ? statesAt(open.value.trace, frame.value) : null, row = states ? rowOf(states, node) : -1;
+  if (!states || row < 0 || kindOf(states.columns.kind[row]) !== "traffic_light") {
+    showSeries("speed", "m/s", node, undefined, true); // a traffic light has no speed
+  }
 }
 
 /** What lets nodes light up in the view while a row has the pointer or the focus. @param {number[]} nodes */
