@@ -230,6 +230,12 @@ def test_predicates_are_shown_as_written(
     assert found in answer.found
 
 
+def test_predicates_of_a_library_pattern_are_shown_as_written(town: Store) -> None:
+    first, *_ = town.why_not("town@20s", "MATCH cut_in()").steps
+
+    assert first.held[2:5] == ("next_lane(e, v)", "NOT same_lane(e, v)", "same_heading(e, v)")
+
+
 def test_notes_show_predicates_as_written(town: Store) -> None:
     define = "DEFINE PREDICATE both(x) AS x.speed > 1 AND x.speed > 99; "
 

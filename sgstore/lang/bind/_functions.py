@@ -31,6 +31,7 @@ from sgstore.model.vocabulary import entity_kinds, normalize_name, relation_name
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from sgstore.lang.bind._symbols import Session
 
 _OTHERS: Final = frozenset(
     {
@@ -394,9 +395,17 @@ def _predicate(e: s.Call, names: SymbolTable) -> b.Bound:
         raise type(error)(reason, text=session.text, span=e.span, hint=hint) from None
     finally:
         session.calls.pop()
-    if not session.calls and not session.shipped:
-        session.written[found] = " ".join(session.text[e.span.start : e.span.end].split())
+    if not session.calls and (written := _written(e, session)):
+        session.written[found] = written
     return found
+
+
+def _written(e: s.Call, session: Session) -> str:
+    """Return a call as the query or the library writes it; empty for other arguments than variables there."""
+    if not session.shipped:
+        return " ".join(session.text[e.span.start : e.span.end].split())
+    names = [one.name for one in e.arguments if isinstance(one, s.Variable)]
+    return f"{e.name}({', '.join(names)})" if len(names) == len(e.arguments) else ""
 
 
 def _meaning(argument: s.Expression, names: SymbolTable) -> Symbol:

@@ -318,7 +318,8 @@ const Icon = ({ path }) => html`<svg class="icon" viewBox="0 0 14 14" aria-hidde
 function Transport() {
   const now = open.value, t = arrived.value >= 0 && now ? timeAt(now.trace, frame.value) : NaN;
   const told = why.value?.at === frame.value ? why.value : null,
-    gap = told?.steps ? told.steps.find((/** @type {any} */ s) => s.failed) : told;
+    failing = told?.steps?.findIndex((/** @type {any} */ s) => s.failed) ?? -1, of = told?.steps?.length || 0,
+    gap = told?.steps ? told.steps[failing] : told;
   return html`<div class="transport">
     <button aria-label="Match before" title="match before (p)" onClick=${() => nextMatch(-1)}>
       <${Icon} path="M3 2h2v10H3zM13 2v10L5.5 7z" /></button>
@@ -343,7 +344,8 @@ function Transport() {
     ${live.value ? null : html`<button aria-label="Close" title="close (Esc)"
       onClick=${() => { playing.value = false; open.value = null; }}>×</button>`}
     ${told ? html`<span class="gap" role="status">${gap?.failed
-      ? html`<span><b>fails</b> <code>${gap.failed}</code>${gap.found ? html` · found <code>${gap.found}</code>`
+      ? html`<span>${failing > 0 ? `step ${failing > 1 ? `1 to ${failing}` : "1"} of ${of} holds · ` : null}
+        <b>${failing >= 0 ? `step ${failing + 1} of ${of} ` : null}fails</b> <code>${gap.failed}</code>${gap.found ? html` · found <code>${gap.found}</code>`
       : null}</span>`
       : told.error ? told.error.reason : "all of it holds in this frame"}
       ${(told.relax || []).map((/** @type {any} */ change) => html`<button class="small"
