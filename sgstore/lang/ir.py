@@ -79,7 +79,7 @@ def any_relation() -> frozenset[str]:
 
 
 Scopes = tuple[tuple[RelationScope | None, tuple[int, ...]], ...]
-"""Scopes of relations, each with the ids of its traces. ``None`` means an unknown scope."""
+"""Relation scopes (settings for entity pairs), each with the ids of its traces. ``None``: unknown scope."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -468,7 +468,7 @@ Bound = (
 )
 
 Calls = dict[Bound, str]
-"""Texts of conditions: meaning of a predicate's call → its text in the query."""
+"""Compiled condition of a predicate call → text of the call in the query."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -631,7 +631,7 @@ class Result:
 
     @property
     def groups(self) -> bool:
-        """True if a row stands for several frames: an aggregate, or ``DISTINCT`` values without the frame."""
+        """True if a row combines several frames: an aggregate, or ``DISTINCT`` values without the frame."""
         return self.aggregated or (self.distinct and not (self.whole or self.framed))
 
     @property

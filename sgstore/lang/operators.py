@@ -550,25 +550,25 @@ NUMERIC: Final[Mapping[str, Operator]] = {
     "exp": _computed(_where("exp({0})", _FINITE), math.exp),
     "log": _computed(f"ln({_where('{0}', 'v > 0 AND isfinite(v)')})", math.log),
 }
-"""Functions of one number."""
+"""Functions of one number, by name in the query language."""
 
 EXTREMES: Final[Mapping[str, Operator]] = {
     "min": _strict(_if_all_known("least"), min, lambda *values: reduce(np.minimum, values)),
     "max": _strict(_if_all_known("greatest"), max, lambda *values: reduce(np.maximum, values)),
 }
-"""Functions of two numbers or more."""
+"""Functions of two or more numbers, by name in the query language."""
 
 OF_TWO: Final[Mapping[str, Operator]] = {
     "atan2": _computed("atan2(...)", math.atan2),
     "pow": _computed(_where("pow({0}, {1})", _FINITE), math.pow),
 }
-"""Functions of two numbers."""
+"""Functions of exactly two numbers, by name in the query language."""
 
 OF_TEXT: Final[Mapping[str, Operator]] = {
     "lower": _strict("lower(...)", str.lower, _of_texts("lower")),
     "upper": _strict("upper(...)", str.upper, _of_texts("upper")),
 }
-"""Functions of one text."""
+"""Functions of one text, by name in the query language."""
 
 OPERATORS: Final[Mapping[str, Operator]] = {
     **COMPARISONS,

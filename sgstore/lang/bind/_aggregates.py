@@ -82,7 +82,7 @@ AGGREGATES: Final[dict[str, AggregateFunction]] = {
     "percentile": AggregateFunction(_quantile, share=True),
     "collect": AggregateFunction(_collected, _VALUES, Type.list),
 }
-"""Aggregates by folded name."""
+"""Aggregate functions of the query language, by name in lower case without underscores."""
 
 EXTREMES: Final = frozenset({"min", "max"})
 """Aggregates whose names are also functions of two or more numbers."""

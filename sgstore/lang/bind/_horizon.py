@@ -448,4 +448,4 @@ COMPUTED: Final[Mapping[str, Callable[[list[Interval]], Interval]]] = {
     "max": lambda parts: (max(low for low, _ in parts), max(high for _, high in parts)),
     "coalesce": lambda parts: (min(low for low, _ in parts), max(high for _, high in parts)),
 }
-"""Functions from the intervals of the operands to the interval of the result."""
+"""Operator → function from the intervals of its operands to the interval of its result."""

@@ -41,7 +41,7 @@ Interval = tuple[float, float]
 _SIGNALS: Final = frozenset(SIGNALS)
 _OWN: Final = frozenset(OWN_ENTITY_KINDS)
 _KINDS: Final = frozenset(OWN_KINDS)
-"""Built-in kinds. Kinds that clients add can be at any end."""
+"""Built-in kinds. An edge can also have a user-defined kind at either end."""
 _WORDS: Final[Mapping[str, b.Kinds]] = {
     "entity": b.Kinds(_OWN, _OWN),
     "body": b.Kinds(_OWN, _OWN - _SIGNALS),

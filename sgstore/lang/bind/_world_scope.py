@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
 _MOST: Final = 3
-"""Largest number of such edges in one pattern in braces, because each subset of them adds a query. Above it, a
-check is unknown, and a pattern matches within the graph only."""
+"""Largest number of edges in braces that are also computed outside the graph. Each subset of them adds a query.
+Above this number, a check is unknown, and a pattern matches within the graph only."""
 
 _SIDES: Final = 10.0
 """Extra distance between the centres of two bodies, compared with their edges: sum of the half lengths; m."""

@@ -67,7 +67,7 @@ _TAKES: Final[Mapping[str, tuple[int, int]]] = {
 """Smallest and largest number of arguments of each SGL function."""
 
 MAX_NUMBER: Final = 1e300
-"""Largest number of the query language."""
+"""Largest number that the query language permits."""
 
 _SIGNS: Final[dict[type[ast.cmpop], str]] = {
     ast.Lt: "<",

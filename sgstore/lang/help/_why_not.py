@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 _WRITTEN_NUMBER: Final = re.compile(
     r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|--[^\n]*|(?<![\w.])(\d+(?:\.\d+)?(?:[eE][-+]?\d+)?)"""
 )
-"""Texts and comments, which are skipped, and numbers."""
+"""Regular expression: quoted texts and comments, which are skipped, or a number."""
 
 
 def _beyond(sign: str, limit: float, value: float) -> float:

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 KINDS_OF_PATTERNS: Final = ("predicate", "concept", "scenario", "property")
-"""Named conditions, common patterns, scenarios of a benchmark, and traffic rules."""
+"""Kinds of library patterns: named conditions, common patterns, scenarios of a benchmark, traffic rules."""
 
 LIBRARY: Final = (
     "std",
@@ -49,7 +49,7 @@ LIBRARY: Final = (
     "sceneflow",
     "rules",
 )
-"""Names of the files, in display order."""
+"""Names of the files in the library, in display order."""
 
 _HEAD: Final = re.compile(rf"-- ({'|'.join(KINDS_OF_PATTERNS)}) (\w+): (\S.*)")
 _PARAMETER: Final = re.compile(r"-- param (\w+) = ('[^']*'(?:\|'[^']*')*|[^\s:]+): (\S.*)")

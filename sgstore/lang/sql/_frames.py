@@ -466,7 +466,7 @@ def _of_kinds(sql: SqlBuilder, scope: Scope, key: str, state: str) -> list[str]:
 def _tables_of(
     sql: SqlBuilder, scope: Scope, key: str, needed: list[Leaf], *, stated: bool = False
 ) -> set[Home]:
-    """Return the tables that hold the needed attributes of a node. ``stated`` if its state is joined anyway."""
+    """Return the tables with the needed attributes of a node. ``stated``: the state table is always used."""
     profile = Profile.of(scope.kinds(key), sql.catalog)
     of_it = [leaf for leaf in needed if key in _valued(leaf)]
     homes = _homes(of_it, profile)

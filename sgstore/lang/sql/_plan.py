@@ -195,7 +195,7 @@ def _is_direct(leaf: Leaf) -> bool:
 
 
 def _edge_alone(found: set[Leaf], scope: Scope, catalog: Catalog) -> str | None:
-    """Return the edge of a condition on the attributes of one edge, and on its lane; or None."""
+    """Return the only edge that a condition uses, if it uses nothing but this edge and its lane; or None."""
     edges = {leaf.edge for leaf in found if isinstance(leaf, EdgeAttribute)}
     if len(edges) != 1:
         return None
