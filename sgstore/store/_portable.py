@@ -124,7 +124,7 @@ def _copy(connection: DuckDBPyConnection, frame_id: Ints) -> None:
 
 
 def _rewrite_views(connection: DuckDBPyConnection) -> None:
-    """Rewrite the views of the copy for older DuckDB versions, which mix enumerations and NULL only as text."""
+    """Rewrite the views of the copy: older DuckDB versions accept enumerations with NULL only as text."""
     for name in ("nodes", "world_nodes"):
         body = shape.expected().views[name]
         connection.execute(
