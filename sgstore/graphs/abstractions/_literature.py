@@ -462,7 +462,7 @@ def _all(rows: NDArray[np.signedinteger], label: str) -> NDArray[np.signedintege
 
 
 def _of_ego(seen: GraphColumns, rows: NDArray[np.signedinteger]) -> list[Part]:
-    """Return the edges of objects with a known position: to one of three lanes, and to or from the ego."""
+    """Return the edges from each object to its left, middle or right lane, and between objects and the ego."""
     ego = np.full(seen.frames, -1)
     own = np.flatnonzero(seen.is_ego)
     ego[seen.node_frame[own]] = own

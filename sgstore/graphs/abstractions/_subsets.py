@@ -60,4 +60,4 @@ SUBSETS: Final[Mapping[str, Subset]] = {
     "junction": Subset(_PARTS, frozenset(OF_JUNCTION), frozenset(OF_JUNCTION)),
     "SG": Subset(None),
 }
-"""Part of the scene graph that each such abstraction keeps. In queries, lanes keep their own names."""
+"""Abstraction → part of the scene graph that it keeps. In queries, lanes keep their own names."""

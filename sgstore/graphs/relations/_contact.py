@@ -44,7 +44,7 @@ SURE: Final = 1e-4
 """Difference from the limit above which the quick test of a separation is certain; m."""
 
 PLAIN: Final = 1e8
-"""Largest positions and headings for which the quick test is exact enough; m, rad."""
+"""Limit of positions (m) and headings (rad) up to which the quick test of distance is exact enough."""
 
 
 def contacts(bodies: Bodies, unwanted: Bools) -> Iterator[tuple[Rows, Rows]]:

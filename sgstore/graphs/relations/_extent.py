@@ -39,7 +39,7 @@ HANG: Final = 6.0
 STEP: Final = 2.0
 """Distance between the points of a lane whose heights are known; m."""
 MOST_POINTS: Final = 1_000_000
-"""Largest number of such points in a map. With more than 2,000 km of lanes, their distance grows."""
+"""Largest number of points with a height in a map. Above 2,000 km of lanes, their distance grows."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ MOVED: Final = 0.3
 
 
 STRAYED: Final = 2.0
-"""The same limit for recordings with noise, in which the boxes of standing vehicles vary more; m."""
+"""Limit in place of :data:`MOVED` in recordings with noise, in which standing boxes vary more; m."""
 
 SHARE: Final = 0.3
 """Smallest share of noisy frames in which a parked vehicle stands."""

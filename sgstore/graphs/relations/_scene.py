@@ -40,10 +40,10 @@ CHUNK: Final = 1 << 16
 """Number of candidates that are processed together. It limits the memory and fits into a cache."""
 
 FAR: Final = 1e9
-"""Largest position on the line; m. Positions beyond it are moved to it, which can only add candidates."""
+"""Limit of interval ends; m. Ends beyond it are moved to it, which can only add candidate pairs."""
 
 _ROUNDING: Final = 1e-15
-"""Relative rounding error of a position on the line on which all groups follow one another."""
+"""Relative rounding error of interval ends, after the intervals of all groups are laid out on one line."""
 
 
 def meeting(group: Ints, low: Floats, high: Floats) -> Iterator[tuple[Rows, Rows]]:
