@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from sgstore.temporal._valuation import Key, Memory, NodeNames, QueryCache
 
 Needs = bool | tuple[tuple[Partial, Term], ...]
-"""True or False, or open terms: the condition is true if one of the terms becomes true."""
+"""State of a condition: True, False, or terms. The condition becomes true with any of the terms."""
 
 
 @dataclass(slots=True)
