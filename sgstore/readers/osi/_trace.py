@@ -161,7 +161,7 @@ _UNSET: Final = "TYPE_UNKNOWN"
 _HEADING: Final = POSE.index("heading")
 _UNKNOWN: Final = -2
 _MOST_AHEAD: Final = 16
-"""Largest number of times for which objects of other channels wait for their frame."""
+"""Largest number of time stamps for which objects of other channels wait until their frame is read."""
 
 
 @dataclass(slots=True)
