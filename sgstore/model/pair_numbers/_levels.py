@@ -53,7 +53,7 @@ STEEPEST: Final = 0.25
 
 
 UNEVEN: Final = {"flat": 1, "storeys": 2, "carried": 4, "near_flat": 8, "near_storeys": 16}
-"""Bits for the special pairs in a trace. ``near``: among moving entities and static road users."""
+"""Bits for the special pairs in a trace. ``near_…``: only among moving entities and static road users."""
 
 
 def all_level(low: Floats, high: Floats, frame: NDArray[np.int64] | None = None) -> bool:
