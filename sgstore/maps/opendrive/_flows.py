@@ -402,7 +402,7 @@ class _Links:
         return len(kinds) == 1 or DRIVING.issuperset(kinds)
 
     def _ahead(self, lane: int, contact: str) -> list[Target]:
-        """Return the ends of sections that may follow a lane without a link.
+        """Return the possible next sections of a lane without a link, each with the end at which they begin.
 
         They are in its road, at the link of its road, or around the junction of its road.
         """
