@@ -44,7 +44,7 @@ Rect = tuple[float, float, float, float]
 WINDOW: Final = 0.0
 LANES: Final = 1.0
 STOREY: Final = 0.03
-"""Difference in drawing order between two storeys of roads. The highest storey stays below the tints."""
+"""Step in the drawing order from one storey of roads to the next. All storeys are drawn below the tints."""
 TINTS: Final = 1.4
 MARKS: Final = 1.6
 SCENERY: Final = 1.8
