@@ -518,7 +518,7 @@ INTERVAL_COLUMNS: Final = (
 trace."""
 
 CLIP_COLUMNS: Final = ("trace", "start_ns", "end_ns")
-"""Columns of a clip: log times, offsets included."""
+"""Columns of a clip. Its start and end are log times that include the offsets around the match."""
 
 Form = Literal["rows", "intervals", "clips", "subgraphs"]
 
@@ -642,7 +642,7 @@ class Result:
 
     @property
     def among_rows(self) -> list[str]:
-        """Words of the clauses that need all rows: sorted, chosen, or counted together."""
+        """Clauses of the result that need all rows, because they sort, select or aggregate them."""
         clauses = {
             "aggregates such as COUNT(*)": self.aggregated,
             "DISTINCT": self.distinct,

@@ -337,7 +337,7 @@ def _unmeasured(node: str, name: str, value: b.Bound) -> b.Bound:
 
 @lru_cache(maxsize=1024)
 def _of_block(block: b.BlockValue) -> tuple[b.Bound, ...]:
-    """Return the conditions that a pattern in braces has a match only if unknown values fit.
+    """Return conditions that are true if a match of a pattern in braces may depend on unknown values.
 
     The result is cached.
     """

@@ -241,7 +241,7 @@ def nearest_query(
 
 
 def _nearest(part: b.Node | b.Edge | b.Bound, scope: b.Scope, writer: Writer) -> tuple[str, str]:
-    """Return the value that the last part of a pattern compares, and the query for the nearest frame."""
+    """Return the value that the last part of a pattern compares, and a query for the nearest frame to it."""
     value, limit, others = "", "", replace(scope, where=scope.where[:-1])
     match part:
         case b.Node():

@@ -188,7 +188,7 @@ def _written(condition: b.Bound, writer: Writer) -> str:
 
 
 def _call_of(conditions: Sequence[b.Bound], scope: b.Scope, calls: b.Calls) -> str:
-    """Return the call whose definition has all these conditions and others; empty without such a call."""
+    """Return the predicate call whose definition contains all these conditions and more; empty without one."""
     for call, text in calls.items():
         parts = b.conjuncts(call)
         inside = len(parts) > len(conditions) and all(one in parts for one in conditions)

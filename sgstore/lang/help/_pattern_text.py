@@ -230,7 +230,7 @@ class Writer:
 
 
 def joined_calls(where: Sequence[b.Bound], calls: b.Calls) -> Iterator[b.Bound]:
-    """Yield the conditions of a pattern. Those of one predicate are joined again."""
+    """Yield the conditions of a pattern, with the conditions of one predicate call joined again."""
     joined = {parts: call for call in calls if len(parts := tuple(b.conjuncts(call))) > 1}
     at = 0
     while at < len(where):

@@ -211,7 +211,7 @@ class Compiled:
 
     @property
     def listed(self) -> Compiled | None:
-        """Return a copy with the same rows and the nodes of each; see :func:`listed_matches`."""
+        """Return a copy for the same rows, with the nodes of each match; see :func:`listed_matches`."""
         query, layout = self.query, self.layout
         if layout is not None:  # without the values of the nodes
             own = query.result.columns[: len(self.bound.result.columns)]

@@ -1,4 +1,4 @@
-"""Queries for the matches that a result lists: in its order and within its limit, each with its nodes."""
+"""Queries for the matches behind the rows of a result: same order and limit, with the nodes of each match."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
     from sgstore.lang.ir import Query, Result
 
 _ENDS: Final = {"trace": "trace", "seq": "end_seq", "time_ns": "end_ns", "t": "end"}
-"""Columns of an interval for the columns of the frame of a row: the row of a sequence has its last frame."""
+"""Column of the last frame of a row → column of an interval. The frame of a sequence row is its last frame."""
 
 
 def listed_matches(query: Query) -> Query | None:
-    """Return a query for the same rows in the same order, with the nodes of each match.
+    """Return a query for the same rows in the same order, with the nodes of each match as columns.
 
     The values of ``RETURN`` are numbered (``:0 speed``), so that no name occurs twice. The matches of a
     sequence are intervals.
@@ -56,7 +56,7 @@ def listed_matches(query: Query) -> Query | None:
 
 
 def _numbered(result: Result) -> Result:
-    """Return a result whose columns have a number before their name."""
+    """Return a result with a number before the name of each column, such as ``:0 speed``."""
     names = {
         column.name: f":{number} {column.name}" for number, column in enumerate(result.columns)
     }
@@ -76,7 +76,7 @@ def _numbered(result: Result) -> Result:
 
 
 def _as_intervals(result: Result, bound: tuple[ReturnColumn, ...]) -> Result:
-    """Return a result of rows as intervals, whose keys of order and choice are columns."""
+    """Return a result with intervals in place of rows. Its sort and sampling keys become columns."""
     keys = dict[Bound, str]()
 
     def named(key: Bound | str) -> str:
@@ -93,7 +93,7 @@ def _as_intervals(result: Result, bound: tuple[ReturnColumn, ...]) -> Result:
 
 
 def _with_keys(result: Result, change: Callable[[Bound | str], Bound | str]) -> Result:
-    """Return a result with a function applied to the keys of its order and of its choices."""
+    """Return a result with a function applied to its sort keys and its sampling keys."""
 
     def each(one: Sampling | None) -> Sampling | None:
         return one if one is None or one.per is None else replace(one, per=change(one.per))

@@ -23,7 +23,7 @@ WIDTH: Final = 12
 """Bits of each count. Twelve integers of five counts each cover 60 frames."""
 
 MOST: Final = (1 << (WIDTH - 1)) - 1
-"""Largest number of rows that such a sum can count."""
+"""Largest number of rows that the bit sums of this module can count without an overflow."""
 
 _ONES: Final = sum(1 << place for place in range(0, 60, WIDTH))
 _TOPS: Final = _ONES << (WIDTH - 1)

@@ -397,7 +397,7 @@ def base_rows(
 
 
 def _from_ego(sql: SqlBuilder, scope: Scope, base: Base) -> tuple[tuple[Edge, ...], range]:
-    """Return the edges in join order, and the numbers of edges after which a step ends.
+    """Return the edges in join order, and the numbers of edges after which the rows become a new subquery.
 
     The database misjudges joins of many tables of masks. So the few rows of the ego, or of the outer pattern,
     come first, and each step begins with a table of the rows found so far.

@@ -66,7 +66,7 @@ sampling keys."""
 LOG_TIME: Final = "log_time_ns"
 
 OF_NODES: Final = "intervals are those of single matches"
-"""Reason for an error about ``HAVING``."""
+"""Reason in an error about ``HAVING`` when the intervals of a query are those of single matches."""
 
 _NAME: Final = NODE_ATTRIBUTES["name"]
 _TRACE_NAME: Final = TraceAttribute(TRACE_ATTRIBUTES["name"], Type.text)
@@ -582,7 +582,7 @@ def _column(leaf: Leaf) -> str:
 
 
 def _kept(value: Bound) -> tuple[Bound, ...]:
-    """Return the expressions that determine a value. For the name of a node: its kind and id."""
+    """Return the expressions from which a value is computed later. For the name of a node: its kind and id."""
     return (
         tuple(leaves(value)) if isinstance(value, Operation) and value.word == "name" else (value,)
     )
