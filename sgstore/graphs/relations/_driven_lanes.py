@@ -422,7 +422,7 @@ class _Crossings:
         return best[begins(self._frame[best])]
 
     def _toll_of(self, cost: Floats) -> Floats:
-        """Return the cost of a change between each candidate lane and the best one; 0 without traffic."""
+        """Return the cost of a lane change between each candidate lane and the best one; 0 without traffic."""
         lane, toll = self.of.lane, self._junctions.toll
         best = lane[self.best(cost)][self._frame]
         change = np.minimum(toll(lane, best), toll(best, lane))
