@@ -88,7 +88,7 @@ def _knowing(
 
 
 def _about_trace(query: Query) -> list[Bound]:
-    """Return the conditions on the trace alone that every match of a query meets."""
+    """Return the conditions on the trace (not on its frames) that every match of a query meets."""
     certain = [query.steps[number].scope for number in sorted(query.certain)]
     each = (c for scope in certain or query.required for w in scope.where for c in conjuncts(w))
     plain = (Operation, Value, Choices, TraceAttribute)

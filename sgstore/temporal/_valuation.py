@@ -130,7 +130,7 @@ class BindingTable(Generic[T]):
         return next(held[wider] for wider in self.lattice.wider(binding) if wider in held)
 
     def keep(self, found: dict[Partial, T], same: Callable[[T, T], bool]) -> None:
-        """Replace the table. Entries equal to the entry of a generalisation are dropped.
+        """Replace the table. Values that also follow from a less specific binding are left out.
 
         Bindings whose value equals that of a generalisation are dropped.
         """
