@@ -208,7 +208,7 @@ class Snapshot:
         return found
 
     def fields_of_some(self, topic: str) -> dict[str, int]:
-        """Return the fields of a topic that some bundles (store files) lack, with their number."""
+        """Return the fields of a topic that some bundles (store files) lack: field → number of such bundles."""
         with_field: dict[str, set[str]] = {}
         for bundle, what, word, _, _ in self.facts["word"]:
             if what == "topic" and json.loads(word)[0] == topic:

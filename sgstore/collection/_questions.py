@@ -888,7 +888,7 @@ class CollectionRows(Tabular):
 
 
 def _null_fields(whole: Collection, text: str) -> Iterator[str]:
-    """Yield a note for each field of a topic in an SQL statement that some bundles lack."""
+    """Yield a note for each topic field that an SQL statement uses, but some bundles (store files) lack."""
     known = whole.catalog.topics
     selects_all = re.search(r"(?<!\()\*", text)
     for name in topics_in_sql(topic_tables(text)):
