@@ -63,9 +63,9 @@ SAME_WAY: Final = math.pi / 4
 TURNS: Final = (0.0, -math.pi / 2)
 """Possible rotations of a light relative to its signal, for landmarks and for CARLA actors; rad."""
 LEARNT_FROM: Final = 3
-"""Smallest number of lights from which a usual offset is computed."""
+"""Smallest number of lights from which a usual offset from the signals is computed."""
 LEARNT_WITHIN: Final = 5.0
-"""Largest distance between such a light and its signal; m."""
+"""Largest distance of a light from its signal, for the light to be used for a usual offset; m."""
 
 MOST_NAMED: Final = 5
 """Largest number of lights or lanes that a warning names."""
