@@ -1,4 +1,4 @@
-"""Union, intersection and difference of locks. Equal test cases have the same frames of the same trace."""
+"""Union, intersection and difference of locks. Test cases with the same frames of a trace are equal."""
 
 from __future__ import annotations
 

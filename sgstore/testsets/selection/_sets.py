@@ -35,7 +35,7 @@ def spread(begin: Ints, end: Ints) -> tuple[Ints, Ints]:
 
 @dataclass(frozen=True)
 class SetFamily:
-    """Family of sets for set covers: elements and cost of each set, and the sets that each element needs.
+    """Family of sets for set covers: elements and cost of each set, and how often each element must be covered.
 
     Attributes
     ----------
