@@ -40,7 +40,7 @@ def answer(store: Store, question: Mapping[str, Any], most: int) -> Reply:
 
 
 _OF_TRACES: Final = {"find", "check"}
-"""Queries that search only the traces of a list."""
+"""Kinds of questions for which the sandbox process searches only the listed traces."""
 
 
 def _listed(
