@@ -29,10 +29,10 @@ COLUMNS: Final = (
 X, HEADING, VX, AX, YAW_RATE, LENGTH, HEIGHT, DERIVED, LIGHT = 0, 3, 4, 6, 8, 9, 11, 12, 13
 
 MOVES: Final = 1.5
-"""Smallest difference of velocity and displacement that counts; m/s. Boxes jitter by 0.3, SUMO people by 1."""
+"""Smallest difference of recorded and real velocity that counts; m/s. Boxes jitter by 0.3, SUMO people by 1."""
 
 UNLIKE: Final = 0.3
-"""Smallest share of the larger one for this difference. The smallest wrong factor is 1.6 (miles for km)."""
+"""Smallest ratio of this difference to the larger speed. The smallest wrong factor is 1.6 (miles for km)."""
 
 COURSE: Final = 3.0
 """Smallest speed at which a vehicle must face its direction of movement; m/s."""
@@ -401,7 +401,7 @@ def judged(tally: Tally) -> Iterator[Contradiction]:
 def _agreed(
     quantity: str, votes: dict[int, Vote], tally: Tally
 ) -> list[tuple[int, Vote, tuple[str, str]]]:
-    """Return the bodies with a result. If no body has one, the votes of all bodies are added up."""
+    """Return the bodies with a contradiction. If no single body has one, return the sum of all votes."""
     told = [
         (node, vote, _verdict(quantity, vote, tally.total(quantity, node)))
         for node, vote in votes.items()
