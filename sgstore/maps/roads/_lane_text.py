@@ -52,7 +52,7 @@ MAX_NAME: Final = 200
 MAX_RELATED: Final = 1_000
 """Largest number of lanes that one relation can link to a lane."""
 OF_LANES: Final = " (lanes)"
-"""Suffix of the names of such maps, because they contain less than the OpenDRIVE map of the same name."""
+"""Suffix of names of maps in lane text, which contain less than the OpenDRIVE map of the same name."""
 DIGITS: Final = 4
 """Number of decimal digits of a length in metres."""
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from sgstore.model.world import Bools, Floats, Ints
 
 PREPARED: Final = Lock()
-"""Only one thread at a time prepares shapes."""
+"""Lock, so that only one thread at a time prepares shapes for shapely."""
 
 
 @dataclass(frozen=True, slots=True)
