@@ -233,7 +233,7 @@ def parted(columns: Columns) -> tuple[Columns, Columns]:
 
 
 def marked(columns: Columns) -> Columns:
-    """Add a column ``repeated`` (True if the values repeat in the next or previous frame), and sort by it."""
+    """Add a column ``repeated`` (equal values in the next or previous frame), and sort by ego and by it."""
     bucket = columns["frame_id"] >> FRAME_BITS
     values = {name: of for name, of in columns.items() if name != "frame_id"}
     same = _as_before({"bucket": bucket, **values})

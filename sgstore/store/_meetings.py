@@ -132,7 +132,7 @@ class RecordedValues:
     def _compute(
         self, reader: DuckDBPyConnection, scope: str, measure: str, trace: int, src: int
     ) -> None:
-        """Compute a measure of an object with all others. For an ego, also compute the following traces."""
+        """Compute a measure of an object with all others. For an ego, compute it for the next traces, too."""
         if not self._traces:
             self._traces = reader.execute(_TRACES).fetchnumpy()
             self._egos = {one: min(nodes) for one, nodes in _egos(reader).items()}
