@@ -428,14 +428,14 @@ class StoreCheck:
 
     @cached_property
     def _premises(self) -> Premises | None:
-        """Premises of a verdict. The status of each frame needs all data, without premises."""
+        """Premises of a verdict; none if the status of each frame is requested, which needs all data."""
         asks = self._plan.asks | self._values.asks
         found = premises_of(self._check, self._plan, self._formula, asks)
         return None if self._want_status else found
 
     @property
     def _narrowing(self) -> Premises | None:
-        """Premises that limit the data to read. Robustness needs the values of all entities."""
+        """Premises that limit the data to read; none for robustness, which needs the values of all entities."""
         return None if self._check.robustness else self._premises
 
     def readers(
@@ -668,7 +668,7 @@ class StoreCheck:
                 return
 
     def _least_margins(self, trace: TraceReader, bindings: Keys) -> Floats | None:
-        """Return the robustness margins (B,) if only least values count, and all values are known."""
+        """Return the robustness margins (B,) from least values alone; ``None`` if they do not suffice."""
         doubts = {doubt for _, doubt in self._plan.states.values() if doubt is not None}
         if not self._least or any(len(trace.relations[name].frames) for name in doubts):
             return None

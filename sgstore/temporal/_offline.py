@@ -648,7 +648,7 @@ def _relate(
 
 
 def _deciding(asks: Mapping[str, Ask], keys: Keys, values: Sequence[Any]) -> Bools:
-    """Return a mask of the rows that are needed, if only least values of a trace and its nodes count.
+    """Return a mask of the rows that can decide a result, if only the least value for the same nodes counts.
 
     Rows that meet a condition, and those with an unknown value, are always needed.
     """

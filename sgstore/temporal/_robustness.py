@@ -183,7 +183,7 @@ def margin_columns(
 
 
 def least_values(plan: CheckPlan, always: Formula) -> dict[str, frozenset[str]]:
-    """Return the signals of which the margin of ``ALWAYS p`` needs only the least values.
+    """Return the signals whose least values alone determine the robustness margin of ``ALWAYS p``.
 
     Then each margin in p is the known value of a signal, and frames without its entities count in favour. The
     result is empty for any other p, because a frame with another value may decide.
