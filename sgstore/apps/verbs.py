@@ -266,7 +266,7 @@ def class_tables(  # noqa: PLR0913 - the options of the commands
     by_frame: bool = False,
     depth: int = 4,
 ) -> tuple[ReportTable, ...]:
-    """Return the tables of a coverage of classes: one, or for ``explain`` features and a tree.
+    """Return the tables of class coverage: one table, or for ``explain`` the features and a decision tree.
 
     Parameters
     ----------

@@ -418,7 +418,7 @@ class StoreTools:
         return ToolAnswer(f"{about['frame']}, {topic}: {size}", about, image, "image/jpeg")
 
     def _from_start(self, row: dict[str, Any]) -> dict[str, Any]:
-        """Return the row of a clip with its start in seconds since the trace began, as other tools have it."""
+        """Return the row of a clip with its start in seconds since the start of its trace, like other tools."""
         if "start_ns" not in row:
             return row
         began = self._store.file.frame(f"{row['trace']}@0s").log_time_ns
