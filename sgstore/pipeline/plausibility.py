@@ -65,7 +65,7 @@ BRAKING: Final = 10.0
 
 GROWTH: Final = 1.5
 GROWN: Final = 0.5
-"""Smallest relative difference between two sizes of a rigid body that counts, and smallest difference in m."""
+"""Smallest change of size of a rigid body that counts: as a share of the size, and in m."""
 
 NOISY: Final = 4.0
 """Factor between the sizes of bodies whose size changes often, as in measured tracks, that counts."""
