@@ -518,7 +518,7 @@ def others(objects: Objects) -> list[str]:
 
 
 def unlisted(connection: DuckDBPyConnection, database: str) -> list[str]:
-    """Return user macros, sequences, types and empty schemas of a database, each as sort and name."""
+    """Return user macros, sequences, types and empty schemas of a database, as texts such as ``macro f``."""
     found = [("macro", name) for name in _names_in(connection, database, "functions", "function")]
     found += [
         ("sequence", name) for name in _names_in(connection, database, "sequences", "sequence")
