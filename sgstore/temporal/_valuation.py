@@ -106,7 +106,7 @@ def _both(one: Partial, other: Partial) -> Partial | None:
 
 
 class BindingTable(Generic[T]):
-    """Table of values for bindings. A binding without an entry has the value of a more general binding.
+    """Table: binding (variables → nodes) → value. Without an entry, the entry of a less specific one counts.
 
     A binding without an entry has the value of its next generalisation (fewer bound variables).
 
