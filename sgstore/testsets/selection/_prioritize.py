@@ -61,7 +61,7 @@ if TYPE_CHECKING:
     from sgstore.testsets.selection._units import Units
 
 MEASURES: Final = ("closing_time", "ttc_mild")
-"""Default criticality measures for the order by risk: at the closing speed, and for mild manoeuvres."""
+"""Default criticality measures for the order by risk: gap divided by closing speed, and ``ttc_mild``."""
 
 RANKED: Final = {name: one for name, one in PAIR_FUNCTIONS.items() if one.sql and one.worse}
 """Criticality measures of entity pairs in a frame that can order test cases."""
