@@ -413,7 +413,7 @@ def _report_slots(
     limit: int | None,
     picture: Path | None,
 ) -> None:
-    """Print a table of declared slots, and draw the pairs of values."""
+    """Print one table about declared slots, and draw the pairs of their values if requested."""
     from sgstore.apps.verbs import listed
     from sgstore.testsets.coverage import Specification, slot_coverage
 
