@@ -201,7 +201,7 @@ def _kept(
 
 
 def _spread(told: list[dict[str, Any]], most: int) -> list[dict[str, Any]]:
-    """Return replies with at most ``most`` matches or violations.
+    """Return replies with at most ``most`` matches or violations in total.
 
     They are spread over the traces, or the first ones in the order of the query.
     """
