@@ -186,7 +186,7 @@ def read_markings(
 def _beside(
     lanes: LaneTable, row: int, ident: int
 ) -> Callable[[tuple[str, str, str, float]], Attributes]:
-    """Return a function from a marking on the border next to lane ``ident`` to attributes of a lane."""
+    """Return a function that converts the marking on a lane's border with lane ``ident`` to lane attributes."""
     # Outside is right for a lane on the right of its road's direction.
     forward = bool(lanes.forward[row])
     is_left = (lanes.ident[row] == ident) == ((lanes.ident[row] < 0) != forward)
