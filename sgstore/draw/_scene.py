@@ -273,7 +273,7 @@ class DrawnFrame:
         return None if a is None or b is None else (a, b)
 
     def _beside_one_another(self, link: DrawnLink) -> tuple[Point, Point] | None:
-        """Return both ends of a line between two map parts, at a distance from entities; or ``None``."""
+        """Return both ends of a line between two map parts, far from entities; ``None`` without such a line."""
         ground = self.ground
         if ground is None or link.a in self.bodies or link.b in self.bodies:
             return None
