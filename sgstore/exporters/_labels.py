@@ -193,7 +193,7 @@ def _answers(
 _RETURNED: Final = "RETURN DISTINCT frame.id AS frame_of_label, ("
 _OF_EGO: Final = f"MATCH (:Ego) {_RETURNED}"
 _OF_ANYTHING: Final = f"MATCH (anything) {_RETURNED}"
-"""Text of a query that stands before an expression."""
+"""Start of a query, which the text of an expression completes. It also matches frames without an ego."""
 
 
 def _of_expression(error: QueryError, text: str) -> QueryError:
