@@ -450,7 +450,7 @@ NODE_ATTRIBUTES: Final = _named(
         ),
     )
 )
-"""Attributes of nodes by folded name, in the order of the documentation."""
+"""Attributes of nodes by name in lower case, in the order of the documentation."""
 
 
 @cache
@@ -559,13 +559,13 @@ EDGE_ATTRIBUTES: Final = _named(
         ),
     )
 )
-"""Attributes of edges by folded name: of ``isIn`` edges (table ``lane_state``), and ``gap`` (``lane_gap``)."""
+"""Attributes of edges, by lower-case name: of ``isIn`` (table ``lane_state``), and ``gap`` (``lane_gap``)."""
 
 FOLLOWING: Final = ("leads", "follows")
 """Relations whose edges have the attribute ``gap``."""
 
 EDGE_ALIASES: Final = {"offset": "laneoffset", "primary": "isprimary"}
-"""Short aliases of edge attributes, folded."""
+"""Short aliases of edge attributes, in lower case."""
 
 
 def class_attribute(abstraction: str, name: str = "") -> Attribute:
@@ -602,7 +602,7 @@ FRAME_ATTRIBUTES: Final = _named(
         class_attribute("RSV", "class"),
     )
 )
-"""Attributes of ``frame`` by folded name (table ``frame``)."""
+"""Attributes of ``frame`` by name in lower case (table ``frame``)."""
 
 _RAIN: Final = (
     "none",
@@ -640,7 +640,7 @@ ENV_ATTRIBUTES: Final = {
         _weather("time_of_day", "hours since midnight"),
     )
 }
-"""Attributes of ``env``: weather and light, by folded name (view ``events``). The words are those of OSI."""
+"""Attributes of ``env``, by lower-case name: weather and light (view ``events``), in words of OSI."""
 
 TRACE_ATTRIBUTES: Final = _named(
     (
@@ -667,7 +667,7 @@ TRACE_ATTRIBUTES: Final = _named(
         Attribute("map", Type.text, {Home.map: "name"}, "name of the road map"),
     )
 )
-"""Attributes of ``trace`` by folded name (table ``trace``)."""
+"""Attributes of ``trace`` by name in lower case (table ``trace``)."""
 
 
 PAIR_NAMES: Final[Mapping[str, str]] = {
@@ -676,7 +676,7 @@ PAIR_NAMES: Final[Mapping[str, str]] = {
     for word in (name, one.column, one.alias)
     if word
 } | {normalize_name(name): name for name in RECORDED}
-"""Functions of two entities by folded name, with aliases, and recorded measures."""
+"""Functions of two entities by name in lower case, with aliases, and recorded measures."""
 
 
 @dataclass(frozen=True, slots=True)

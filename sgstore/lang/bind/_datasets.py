@@ -21,7 +21,7 @@ CLASSES_GIVEN: Final = "sgstore_classes"
 ``dataset``, ``abstraction``, ``class``, ``frames``."""
 
 CLASSES: Final = "datasetclasses"
-"""Folded name of the function after ``IN``: ``frame.class IN dataset_classes('train')``."""
+"""Name (in lower case) of the function after ``IN``: ``frame.class IN dataset_classes('train')``."""
 
 
 def traces_in(

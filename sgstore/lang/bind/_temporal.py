@@ -250,7 +250,7 @@ COURSES: Final[dict[str, Callable[[s.Call, SymbolTable], b.Bound]]] = {
     "existsnow": _exists_now,
     "t": _moment,
 }
-"""Functions over time, by folded name."""
+"""Functions over time, by name in lower case."""
 
 
 def _refuse_in_block(word: str, span: TextSpan, names: SymbolTable) -> None:
