@@ -48,7 +48,7 @@ TESTS = {
     "importing": "importing openlabel",
     "json_text": "serve export_mcap",
     "markup": "opendrive_document lanelet2",
-    "matches": "query query_recordings api rows",
+    "matches": "query query_recordings api rows listed_matches",
     "mcap": "mcap_* ahead order",
     "numba_loops": "compiled",
     "opendrive": "opendrive_*",
