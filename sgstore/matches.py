@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import copy
 import re
-from collections import namedtuple
+from bisect import bisect_right
+from collections import defaultdict, namedtuple
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from heapq import merge
 from itertools import chain, islice
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar, overload
 from weakref import ref
@@ -518,7 +520,7 @@ class Matches(Tabular):
         108
         """
         with self._compiled() as compiled:
-            if compiled.limited_to_frames is not None:
+            if compiled.limited_to_frames is not None or compiled.drops_intervals:
                 return len({row[0] for row in self._frames()})
             many = self._file.rows(**self._asked(compiled.count())).values[0][0]
             self._some = many > 0
@@ -527,7 +529,8 @@ class Matches(Tabular):
     def frames(self) -> Iterator[FrameRef]:
         """Yield each matching frame once, ordered by trace name and frame number.
 
-        Limited rows keep their order.
+        Limited rows keep their order. If ``RETURN INTERVALS`` has a limit or ``HAVING``, only frames in the
+        chosen intervals are yielded.
 
         Examples
         --------
@@ -544,6 +547,8 @@ class Matches(Tabular):
             rows = self._answered("frames")
             if compiled.limited_to_frames is not None:
                 rows = dict.fromkeys((*row[: len(FRAME_COLUMNS)], row[-1]) for row in rows)
+            elif compiled.drops_intervals:
+                rows = _rows_within(rows, self.intervals())
             yield from rows
 
     def bindings(self, frame: FrameRef) -> list[dict[str, int]]:
@@ -742,7 +747,7 @@ class Matches(Tabular):
         """
         start, end = round(before * 1e9), round(after * 1e9)
         with self._compiled() as compiled:
-            if compiled.limited_to_frames is not None:
+            if compiled.limited_to_frames is not None or compiled.drops_intervals:
                 frames = ((row[1], row[-1]) for row in self._frames())
                 around = (Clip(trace, time - start, time + end) for trace, time in frames)
                 clips = sorted(around, key=lambda clip: (natural(clip.trace), clip.start_ns))
@@ -1323,6 +1328,24 @@ class Windows:
         yield Window.of(group)
         grown = GROWTH * max(used, self._size)
         self._size = max(min(grown, used * ROWS // max(self.rows, 1), LAST_WINDOW), 1)
+
+
+def _rows_within(
+    rows: Iterable[tuple[Any, ...]], intervals: Iterable[Interval]
+) -> Iterator[tuple[Any, ...]]:
+    """Yield the rows of frames that lie in one of some intervals."""
+    spans = defaultdict[str, list[tuple[int, int]]](list)
+    for trace, start, end in sorted((one.trace, one.start_seq, one.end_seq) for one in intervals):
+        known = spans[trace]
+        if known and start <= known[-1][1]:
+            known[-1] = known[-1][0], max(known[-1][1], end)
+        else:
+            known.append((start, end))
+    for row in rows:
+        known = spans.get(row[1], [])
+        at = bisect_right(known, row[2], key=itemgetter(0))
+        if at and row[2] <= known[at - 1][1]:
+            yield row
 
 
 def intervals_for_people(

@@ -148,3 +148,31 @@ def test_intervals_do_not_ignore_having(
 ) -> None:
     with pytest.raises(QueryError, match=wrong):
         next(open_town.find(f"{NEAR} RETURN {returned}").intervals(bound=bound))
+
+
+SEQUENCE = "MATCH (e:Ego)-[:near]->(v:Vehicle) THEN WITHIN 2s MATCH (e)-[:near_coll]->(v)"
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        f"{NEAR} RETURN v.name, INTERVALS LIMIT 2",
+        f"{NEAR} RETURN v.name, INTERVALS ORDER BY frames DESC LIMIT 3",
+        f"{NEAR} RETURN v.name, INTERVALS SKIP 4",
+        f"{NEAR} RETURN v.name, INTERVALS LIMIT 1 PER trace.name",
+        f"{NEAR} RETURN v.name, {LEAST} AS least, INTERVALS HAVING least < 1",
+        f"{SEQUENCE} RETURN v.name, INTERVALS LIMIT 1",
+        f"{NEAR} RETURN v.name, INTERVALS HAVING {LEAST} < 0",
+    ],
+)
+def test_frames_and_clips_are_of_the_chosen_intervals(query: str, open_town: Store) -> None:
+    matches, every = open_town.find(query), open_town.find(query.partition(" RETURN ")[0])
+    spans = [range(one.start_seq, one.end_seq + 1) for one in matches.intervals()]
+    wanted = {one.seq for one in every.frames() if any(one.seq in span for span in spans)}
+    times = {one.seq: one.log_time_ns for one in every.frames()}
+
+    assert [one.seq for one in matches.frames()] == sorted(wanted)
+    assert matches.count() == len(wanted) < every.count()
+    assert {
+        n for n, at in times.items() for c in matches.clips() if c.start_ns <= at <= c.end_ns
+    } == wanted

@@ -210,6 +210,12 @@ class Compiled:
         return replace(self, query=replace(self.query, result=result))
 
     @property
+    def drops_intervals(self) -> bool:
+        """True if the query returns intervals, and a limit or a condition on them drops some."""
+        result = self.query.result
+        return result.form == "intervals" and result.chooses and not result.aggregated
+
+    @property
     def listed(self) -> Compiled | None:
         """Return a copy for the same rows, with the nodes of each match; see :func:`listed_matches`."""
         query, layout = self.query, self.layout
