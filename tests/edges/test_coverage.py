@@ -396,6 +396,24 @@ def test_each_feature_has_a_query_that_finds_the_frames_that_have_it(
             assert (query, store.find(query).count()) == (query, found.found.frames[row])
 
 
+@pytest.mark.parametrize("name", ["omega_prime/pedestrian.osi", "esmini/highway_merge.mcap"])
+def test_each_feature_of_a_recording_has_a_query_for_its_frames(
+    name: str, data: Path, tmp_path: Path
+) -> None:
+    """In a recording without an ego no lane has a role."""
+    path = tmp_path / "s.sgstore"
+    ingest(path, [data / "traces" / name])
+    store = sgstore.open(path)
+    for abstraction in ("EL", "RSV"):
+        found = combos(classed(selection_of(str(path)), abstraction), abstraction, 1)
+        pairs = zip(found.found.features.names, found.found.frames.tolist(), strict=True)
+        with store.file.snapshot():
+            for feature, frames in pairs:
+                query = query_of_features([feature])
+                assert query is not None
+                assert (query, store.find(query).count()) == (query, frames)
+
+
 def test_too_many_combinations_are_an_error_and_not_a_part_of_them(
     worlds: Worlds, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -19,8 +19,11 @@ if TYPE_CHECKING:
 
 _EGOS: Final = ("ego", "ego_car")
 _ROLE: Final = re.compile(r"Ego Lane|(Left|Right) \d+ of Ego Lane|Opposing Lane \d+")
+_LANE: Final = "Lane"
+"""Label of a lane for traffic in frames without a lane of the ego, where lanes have no role."""
+
+_NO_EGO_LANE: Final = "NOT EXISTS {(:Ego)-[:isIn {is_primary: TRUE}]->(:Lane)}"
 _PARTS: Final = {
-    "Lane": ":Lane",
     "Off Road": ":OffRoad",
     "Road": ":Road",
     "Root Road": ":Road",
@@ -36,12 +39,16 @@ def query_of_features(features: Sequence[tuple[str, ...]]) -> str | None:
     features : sequence
         Labels of an edge's source, edge and destination; or of a node.
     """
-    patterns = [_pattern(feature) for feature in features]
+    patterns = [_pattern(feature, f"lane{n}") for n, feature in enumerate(features, start=1)]
     known = [pattern for pattern in patterns if pattern is not None]
     if len(known) < len(patterns):
         return None
-    rest = " AND ".join(f"EXISTS {{{pattern}}}" for pattern in known[1:])
-    return f"MATCH {known[0]}{' WHERE ' if rest else ''}{rest} RETURN FRAMES"
+    (first, condition), *others = known
+    blocks = (f"{one} WHERE {meets}" if meets else one for one, meets in others)
+    where = " AND ".join(
+        [*([condition] if condition else []), *(f"EXISTS {{{b}}}" for b in blocks)]
+    )
+    return f"MATCH {first}{' WHERE ' if where else ''}{where} RETURN FRAMES"
 
 
 def is_of_ego(feature: Sequence[str]) -> bool:
@@ -49,11 +56,14 @@ def is_of_ego(feature: Sequence[str]) -> bool:
     return any(label in _EGOS or _ROLE.fullmatch(label) for label in feature[::2])
 
 
-def _pattern(feature: Sequence[str]) -> str | None:
-    nodes = [_node(label) for label in feature[::2]]
+def _pattern(feature: Sequence[str], lane: str) -> tuple[str, str] | None:
+    """Return the pattern of a feature, and its condition on a lane with the given variable; or None."""
+    nodes = [f"({lane}:Lane)" if label == _LANE else _node(label) for label in feature[::2]]
     if any(node is None for node in nodes):
         return None
-    return f"{nodes[0]}-[:{feature[1]}]->{nodes[1]}" if len(feature) > 1 else nodes[0]
+    condition = f"for_traffic({lane}) AND {lane}.role IS NULL AND {_NO_EGO_LANE}"
+    pattern = f"{nodes[0]}-[:{feature[1]}]->{nodes[1]}" if len(feature) > 1 else nodes[0]
+    return str(pattern), condition if _LANE in feature[::2] else ""
 
 
 def _node(label: str) -> str | None:
