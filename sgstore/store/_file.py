@@ -10,7 +10,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 
@@ -71,6 +71,9 @@ if TYPE_CHECKING:
 
 
 T = TypeVar("T")
+
+_AT_ONCE: Final = 64
+"""Largest number of traces that are deleted in one transaction."""
 
 
 def _damage(connection: DuckDBPyConnection, path: Path) -> str:
@@ -683,7 +686,9 @@ class StoreFile:
             return trace_of_request(connection, digest, request) if digest else None
 
     def remove(self, *traces: int | str) -> tuple[StoredTrace, ...]:
-        """Delete traces in one transaction, with the settings and maps that no other trace uses.
+        """Delete traces, with the settings and maps that no other trace uses.
+
+        Up to 64 traces are deleted in one transaction.
 
         Raises
         ------
@@ -695,9 +700,13 @@ class StoreFile:
 
         with self.access.reading():
             gone = {trace.trace_id: trace for trace in map(self.trace, traces)}
-        with scratch(spill_folder()) as connection, self.access.writing(connection):
-            for trace_id in gone:
-                remove(connection, trace_id)
+        ids = list(gone)
+        for first in range(0, len(ids), _AT_ONCE):
+            # The database keeps all deletions of a transaction in memory.
+            database = scratch(spill_folder(), memory=self.memory)
+            with database as connection, self.access.writing(connection):
+                for trace_id in ids[first : first + _AT_ONCE]:
+                    remove(connection, trace_id)
         return tuple(gone.values())
 
     @property

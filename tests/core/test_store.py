@@ -331,6 +331,22 @@ def test_a_removed_trace_leaves_nothing_behind(tmp_path: Path) -> None:
     assert [trace.name for trace in store.traces()] == ["one"]
 
 
+def test_many_traces_are_removed_in_several_transactions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The database keeps the deletions of a transaction in memory."""
+    store = StoreFile.create(tmp_path / "s.db")
+    names = [publish(store, RandomTrace(n, path=f"trace {n}")) for n in range(5)]
+    before = store.stamp
+    monkeypatch.setattr("sgstore.store._file._AT_ONCE", 2)
+
+    gone = store.remove(*names[:4])
+
+    assert [trace.name for trace in gone] == names[:4]
+    assert [trace.name for trace in store.traces()] == names[4:]
+    assert store.stamp != before
+
+
 def test_a_map_stays_while_a_trace_lies_on_it(tmp_path: Path) -> None:
     store = StoreFile.create(tmp_path / "s.db")
     roads = map_stub()
