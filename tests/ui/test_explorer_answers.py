@@ -300,3 +300,18 @@ def test_a_label_of_the_pattern_lies_between_its_nodes(page: Any) -> None:
     left, right = sorted(nodes, key=lambda one: one["x"])
     assert left["x"] + left["width"] < label["x"]
     assert label["x"] + label["width"] < right["x"]
+
+
+def test_a_rule_of_the_library_is_checked(page: Any, town_store: Path) -> None:
+    page.locator(".card", has_text="r in2 red light").first.click()
+    told = list(Store(town_store).check("r_in2_red_light"))
+    row = page.locator(".verdicts tbody tr")
+    expect(row).to_have_count(len(told))
+    expect(row.first).to_contain_text(told[0].verdict)
+    expect(page.locator(".cm-content")).to_contain_text("CHECK r_in2_red_light")
+    search(page, "r_in2_red_light")
+    expect(row.first).to_contain_text(told[0].verdict)
+    search(page, "USING RANGE 200 CHECK slow: ALWAYS ego.speed < 3")
+    violations = sum(len(one.violations) for one in Store(town_store).check("ALWAYS ego.speed < 3"))
+    assert violations
+    expect(page.locator(".tile")).to_have_count(violations)

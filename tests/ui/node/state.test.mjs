@@ -40,3 +40,18 @@ test("words of a shell are quoted where they must be", () => {
   assert.equal(quoted("/data/drives.sgstore"), "/data/drives.sgstore");
   assert.equal(quoted("it's here"), "'it'\\''s here'");
 });
+
+test("a check is told from a pattern, whatever stands before it", () => {
+  state.library.value = [{ name: "phi1", kind: "property" }, { name: "cut_in", kind: "scenario" }];
+  for (const text of ["CHECK ALWAYS a.x < 1", "USING RANGE 200\nCHECK c: ALWAYS a.x < 1", " phi1 ",
+    "-- MATCH\nDEFINE f(a) AS EXISTS {MATCH (a)}; USING END pending CHECK f(ego)"]) {
+    assert.ok(state.isCheck(text), text);
+    assert.ok(!state.isPattern(text), text);
+  }
+  for (const text of ["MATCH (check:Car)", "cut_in", "USING RANGE 9 MATCH (x) WHERE x.name = 'CHECK' -- CHECK"]) {
+    assert.ok(!state.isCheck(text), text);
+    assert.ok(state.isPattern(text), text);
+  }
+  assert.ok(!state.isCheck("SELECT 1") && !state.isPattern("SELECT 1"));
+  state.library.value = [];
+});

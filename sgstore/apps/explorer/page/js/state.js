@@ -96,9 +96,20 @@ export function frameNamed(name) {
 /** @param {Match} m */
 export const keyOf = (m) => `${m.trace}#${m.first}-${m.last}:${Object.values(m.binding).join(",")}`;
 
+/** A text without its comments, and without what is in quotes. @param {string} query */
+const bare = (query) => query.replace(/'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|--[^\n]*/g, " ");
+
+/** True for checks, or the name of one. Settings (USING) and definitions may stand before a check.
+ * @param {string} query */
+export function isCheck(query) {
+  const text = bare(query).replace(/\bDEFINE\b[^;]*;/gi, " ").trim();
+  return /\b(?:CHECK|MATCH|SELECT|FROM)\b/i.exec(text)?.[0].toUpperCase() === "CHECK"
+    || library.value.some((one) => one.kind === "property" && one.name === text);
+}
+
 /** True for a pattern, or the name of one: no check, and no SQL. @param {string} query */
-export const isPattern = (query) => /\bMATCH\b/i.test(query)
-  || /^\s*(?!SELECT|FROM|CHECK)\w+\s*(?:\([^)]*\))?\s*$/i.test(query);
+export const isPattern = (query) => !isCheck(query) && (/\bMATCH\b/i.test(query)
+  || /^\s*(?!SELECT|FROM)\w+\s*(?:\([^)]*\))?\s*$/i.test(query));
 
 /** The last word of the page on a fault or an act. @param {string} message */
 export function say(message) {
@@ -143,8 +154,7 @@ export function parametersOf(query) {
 /** Names of parameters in a text, those in quotes and comments left out.
  * @param {string} query */
 export function namesIn(query) {
-  const bare = query.replace(/'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|--[^\n]*/g, " ");
-  return [...new Set([...bare.matchAll(/\$(\w+)/g)].map((m) => /** @type {string} */ (m[1])))];
+  return [...new Set([...bare(query).matchAll(/\$(\w+)/g)].map((m) => /** @type {string} */ (m[1])))];
 }
 
 export function cancel() {
@@ -194,9 +204,8 @@ export async function find(how = {}) {
     changed.value = false;
   });
   remember(query);
-  const checks = /^\s*(?:--[^\n]*\n\s*)*(?:DEFINE\b[^;]*;\s*)*CHECK\b/i.test(query);
   try {
-    if (checks) {
+    if (isCheck(query)) {
       const found = await api.json("api/check", { text: query, parameters }, { signal: mine.signal });
       if (mine.signal.aborted) return false;
       await follow(found.stamp);
