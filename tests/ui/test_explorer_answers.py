@@ -315,3 +315,42 @@ def test_a_rule_of_the_library_is_checked(page: Any, town_store: Path) -> None:
     violations = sum(len(one.violations) for one in Store(town_store).check("ALWAYS ego.speed < 3"))
     assert violations
     expect(page.locator(".tile")).to_have_count(violations)
+
+
+def test_matches_that_a_filter_hides_are_told(page: Any) -> None:
+    def answer(route: Any) -> None:
+        told = route.fetch().json()
+        told["traces"].append({**told["traces"][0], "name": "another"})
+        route.fulfill(json=told)
+
+    page.route("**/api/store", answer)
+    page.reload()
+    search(page, NEAR)
+    many = page.locator(".status b").first.inner_text()
+    page.get_by_label("trace", exact=True).select_option("another")
+    search(page, f"{NEAR} WHERE e.speed >= 0")
+    expect(page.locator(".status")).to_contain_text("0 matches in 0 traces")
+    expect(page.locator(".status")).to_contain_text(f"{many} matches in other traces")
+    page.get_by_role("button", name="show all").click()
+    expect(page.locator(".status b").first).to_have_text(many)
+    expect(page.locator(".tile").first).to_be_visible()
+    expect(page.get_by_role("button", name="show all")).to_have_count(0)
+    page.unroute("**/api/store")
+    page.reload()
+
+
+def test_the_list_of_traces_without_an_answer_moves_nothing(page: Any) -> None:
+    reasons = '{"reasons": {"a run": "it has no topic /imu", "b run": "it has no road map"}}\n'
+    page.route(
+        "**/api/find", lambda route: route.fulfill(body=route.fetch().text() + reasons, status=200)
+    )
+    search(page, NEAR)
+    buttons = page.locator(".status > button, .status > select")
+    before = [one.bounding_box() for one in buttons.all()]
+    assert len(before) > 1
+    page.get_by_text("2 traces cannot answer").click()
+    listed = page.locator(".why-left ul")
+    expect(listed).to_contain_text("a run: it has no topic /imu")
+    assert [one.bounding_box() for one in buttons.all()] == before
+    page.keyboard.press("Escape")
+    expect(listed).to_be_hidden()

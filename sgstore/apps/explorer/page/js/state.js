@@ -74,6 +74,8 @@ export const matches = computed(() => {
     .filter((m) => (!trace || m.trace === trace) && (!map || traces.value.get(m.trace)?.map === map));
   return ordered(some, order.value);
 });
+/** How many matches the filter hides. */
+export const hidden = computed(() => answer.value.matches.length - matches.value.length);
 /** Frames that match, each once. */
 export const framesFound = computed(() => {
   const ends = new Map();

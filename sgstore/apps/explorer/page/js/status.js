@@ -3,8 +3,8 @@
 import { h, htm, useEffect, useState } from "../vendor/core.js";
 import * as api from "./api.js";
 import { BY_QUERY, ORDERS } from "./order.js";
-import { answer, filter, find, framesFound, isPattern, matches, offline, open, order, sought, store,
-  tickAll } from "./state.js";
+import { answer, filter, find, framesFound, hidden, isPattern, matches, offline, open, order, sought,
+  store, tickAll } from "./state.js";
 
 const html = htm.bind(h);
 
@@ -40,10 +40,21 @@ function Form() {
     <button class="small" onClick=${() => find({ rows: !rows })}>${rows ? "pictures" : "table"}</button>`;
 }
 
+/** Close a list that lies over the page: by the Escape key, or when the focus leaves it. @param {Event} event */
+function leave(event) {
+  const list = /** @type {HTMLDetailsElement} */ (event.currentTarget);
+  if (event instanceof KeyboardEvent ? event.key !== "Escape"
+    : list.contains(/** @type {Node | null} */ (/** @type {FocusEvent} */ (event).relatedTarget))) return;
+  if (list.open) event.stopPropagation();
+  list.open = false;
+}
+
 export function Status() {
   const told = answer.value, { frames, traces: many } = framesFound.value, found = matches.value.length;
   const left = Object.entries(told.reasons || {});
   if (told.state === "idle" || sought.value.trim()) return null;
+  const wordOf = (/** @type {number} */ n) => (told.verdicts ? (n === 1 ? "violation" : "violations")
+    : n === 1 ? "match" : "matches");
   const where = filter.value, all = /** @type {import("./state.js").Trace[]} */ (store.value.traces);
   const known = { trace: all.map((t) => t.name), map: [...new Set(all.map((t) => t.map).filter(Boolean))] };
   return html`<div class="status" role="status" aria-live="polite">
@@ -52,17 +63,19 @@ export function Status() {
     ${told.error ? html`<div class="error"><b>${reasonShown(told.error)}</b>
       ${told.error.hint && open.value ? html` · ${told.error.hint}` : null}</div>`
       : told.rows ? html`<span><b>${told.rows.length.toLocaleString("en")}</b> rows</span>`
-      : html`<span><b>${found.toLocaleString("en")}</b> ${told.verdicts ? (found === 1 ? "violation" : "violations")
-        : found === 1 ? "match" : "matches"} in ${many} ${many === 1 ? "trace"
+      : html`<span><b>${found.toLocaleString("en")}</b> ${wordOf(found)} in ${many} ${many === 1 ? "trace"
         : "traces"}, ${frames.toLocaleString("en")} frames</span>`}
+    ${hidden.value && !told.rows ? html`<span class="note">${hidden.value.toLocaleString("en")} ${wordOf(hidden.value)}${" "}
+      in other traces</span><button class="small" onClick=${() => { filter.value = { trace: "", map: "" }; }}>
+      show all</button>` : null}
     ${told.ms && !offline.value ? html`<span class="faint">${Math.round(told.ms)} ms</span>` : null}
     ${told.state === "cancelled" ? html`<span class="note">stopped: this is what was found before</span>` : null}
     ${told.truncated ? html`<span class="note">there are more: only the first ${(told.count || told.rows?.length
       || found).toLocaleString("en")} are shown</span>` : null}
     ${(told.notes || []).map((/** @type {string} */ note) => html`<span class="note">${note}</span>`)}
-    ${left.length ? html`<details class="why-left"><summary>
+    ${left.length ? html`<details class="why-left" onFocusOut=${leave} onKeyDown=${leave}><summary>
       ${left.length} ${left.length === 1 ? "trace" : "traces"} cannot answer</summary>
-      <ul>${left.map(([trace, reason]) => html`<li><b>${trace}</b>: ${reason}</li>`)}</ul></details>` : null}
+      <ul tabindex="0">${left.map(([trace, reason]) => html`<li><b>${trace}</b>: ${reason}</li>`)}</ul></details>` : null}
     <span class="grow"></span>
     ${/** @type {const} */ (["trace", "map"]).map((of) => (known[of].length < 2 ? null
       : html`<select aria-label=${of} value=${where[of]}
