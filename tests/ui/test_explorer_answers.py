@@ -339,6 +339,20 @@ def test_matches_that_a_filter_hides_are_told(page: Any) -> None:
     page.reload()
 
 
+COUNTS_OUTSIDE: Final = """() => [...document.querySelectorAll(".card")].filter(card => {
+  const whole = card.getBoundingClientRect(), one = card.querySelector("h3 > :last-child");
+  return one.getBoundingClientRect().right > whole.right;
+}).map(card => card.querySelector("h3").textContent)"""
+
+
+def test_the_count_of_a_card_is_inside_it(page: Any) -> None:
+    for width in (1440, 1240, 390):
+        page.set_viewport_size({"width": width, "height": 900})
+        assert page.locator(".card").count() > 100
+        assert page.evaluate(COUNTS_OUTSIDE) == []
+    page.set_viewport_size({"width": 1440, "height": 900})
+
+
 def test_the_list_of_traces_without_an_answer_moves_nothing(page: Any) -> None:
     reasons = '{"reasons": {"a run": "it has no topic /imu", "b run": "it has no road map"}}\n'
     page.route(
@@ -354,3 +368,27 @@ def test_the_list_of_traces_without_an_answer_moves_nothing(page: Any) -> None:
     assert [one.bounding_box() for one in buttons.all()] == before
     page.keyboard.press("Escape")
     expect(listed).to_be_hidden()
+
+
+def test_cards_can_be_sorted_again_when_all_counts_are_in(page: Any) -> None:
+    def answer(route: Any) -> None:
+        some = len(route.request.post_data_json["text"]) % 2
+        lines = '{"names": []}\n' + '{"matches": [["town", 0, 0, 0, 0]]}\n' * some
+        route.fulfill(body=lines)
+
+    release = hold(page, "**/api/find")
+    page.reload()
+    page.locator(".card").nth(50).wait_for()
+    page.get_by_role("button", name="those with matches first").click()
+    again = page.get_by_role("button", name="counts are in: sort")
+    expect(again).to_have_count(0)
+    page.route("**/find", answer)
+    release()
+    again.click()
+    groups = page.evaluate("""() => [...document.querySelectorAll(".cards")].map(
+      group => [...group.querySelectorAll(".card")].map(card => card.querySelector(".badge") !== null))""")
+    assert any(True in group and False in group for group in groups)
+    assert groups == [sorted(group, reverse=True) for group in groups]
+    expect(again).to_have_count(0)
+    page.unroute("**/find")
+    page.reload()

@@ -124,7 +124,7 @@ function Card({ one }) {
     : html`<span class="faint">…</span>`;
   return html`<button class="card" key=${one.name} onClick=${() => ask(one.text)}>
     <h3>${one.name.replace(/_/g, " ")} <small title=${one.source}>${one.library}</small>
-      <span class="grow"></span>${many}</h3>
+      <span class="grow"></span><span class="many">${many}</span></h3>
     <p>${one.sentence}</p>
     ${one.kind === "property" ? null : html`<svg viewBox="0 0 250 18" preserveAspectRatio="none"
       shape-rendering="crispEdges" aria-hidden="true">
@@ -166,13 +166,17 @@ export function Start() {
   const some = library.value.filter((one) => one.kind !== "predicate"),
     kinds = [...new Set(some.map((one) => one.library))];
   const known = foundFirst.value, text = sought.value.trim();
-  const found = (/** @type {Entry} */ one) => Number((known?.[one.name]?.count || 0) > 0);
+  const found = (/** @type {Entry} */ one, by = known) => Number((by?.[one.name]?.count || 0) > 0);
+  const whole = some.every((one) => one.kind === "property" || tally.value[one.name]),
+    moves = known && whole && some.some((one) => found(one) !== found(one, tally.value));
   return html`<div class="sheet" tabindex="0">
     ${text ? html`<${Near} text=${text} />` : !some.length ? html`<p class="faint">Reading the library …</p>`
       : html`<p class="faint">Type a pattern above, search in words, or begin with one of these ${some.length}.
       Each card has its matches in this store, and where they are in time.
       ${" "}<button class="small" aria-pressed=${known !== null}
-        onClick=${() => { foundFirst.value = known ? null : tally.value; }}>those with matches first</button></p>
+        onClick=${() => { foundFirst.value = known ? null : tally.value; }}>those with matches first</button>
+      ${moves ? html` <button class="small" onClick=${() => { foundFirst.value = tally.value; }}>
+        counts are in: sort</button>` : null}</p>
       ${kinds.map((kind) => html`<h2>${kind}</h2><div class="cards">
         ${some.filter((one) => one.library === kind).sort((a,
           b) => found(b) - found(a)).map((one) => html`<${Card} one=${one} />`)}</div>`)}`}</div>`;
