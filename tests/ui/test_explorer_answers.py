@@ -370,6 +370,21 @@ def test_the_list_of_traces_without_an_answer_moves_nothing(page: Any) -> None:
     expect(listed).to_be_hidden()
 
 
+def test_a_slider_is_of_the_number_in_the_text(page: Any) -> None:
+    slider = page.get_by_label("Number under the cursor")
+    search(page, "MATCH (e:Ego) WHERE e.speed > 30")
+    expect(slider).to_have_attribute("max", "90")
+    search(page, "MATCH (v:Car) WHERE v.speed > 2")
+    expect(slider).to_have_attribute("max", "6")
+    slider.fill("5")
+    expect(page.locator(".cm-content")).to_have_text("MATCH (v:Car) WHERE v.speed > 5")
+    expect(slider).to_have_attribute("max", "6")
+    page.get_by_role("button", name="Compare").click()
+    page.get_by_role("button", name="sgstore", exact=True).click()
+    page.locator(".card").first.wait_for()
+    expect(slider).to_have_count(0)
+
+
 def test_cards_can_be_sorted_again_when_all_counts_are_in(page: Any) -> None:
     def answer(route: Any) -> None:
         some = len(route.request.post_data_json["text"]) % 2

@@ -13,8 +13,8 @@ import { answer, find, text, words } from "./state.js";
 const html = htm.bind(h);
 const nonce = document.querySelector("meta[name=csp-nonce]")?.getAttribute("content") || "";
 
-/** The number under the cursor: where it stands, and what it is. */
-export const number = signal(/** @type {{from: number, to: number, value: number} | null} */ (null));
+/** The number under the cursor: the text that it is of, where it stands, and what it is. */
+export const number = signal(/** @type {{of: string, from: number, to: number, value: number} | null} */ (null));
 /** @type {any} */
 let editor = null;
 
@@ -114,7 +114,8 @@ function numberAt(state) {
   const { head } = state.selection.main, line = state.doc.lineAt(head);
   for (const m of line.text.matchAll(/'(?:[^'\\]|\\.)*'|--.*|(?<![\w.$])\d+(?:\.\d+)?/g)) {
     const from = line.from + (m.index || 0), to = from + m[0].length;
-    if (/^\d/.test(m[0]) && head >= from && head <= to) return { from, to, value: Number(m[0]) };
+    if (/^\d/.test(m[0]) && head >= from && head <= to) return { of: state.doc.toString(), from, to,
+      value: Number(m[0]) };
   }
   return null;
 }
@@ -171,11 +172,12 @@ let waiting = 0;
 /** A slider for the number under the cursor, which asks again. */
 export function NumberSlider() {
   const at = number.value;
-  const range = useRef({ from: -1, low: 0, high: 1, step: 0.1 });
-  if (!at) return null;
-  if (range.current.from !== at.from) {
+  const range = useRef({ rest: "", low: 0, high: 1, step: 0.1 });
+  if (!at || at.of !== text.value) return null; // the text may change while there is no editor
+  const rest = `${at.of.slice(0, at.from)}\n${at.of.slice(at.to)}`; // while this stays, the range does
+  if (range.current.rest !== rest || at.value > range.current.high) {
     const size = Math.abs(at.value) || 1, step = 10 ** Math.floor(Math.log10(size) - 1);
-    range.current = { from: at.from, low: 0, high: Number((size * 3).toPrecision(2)), step };
+    range.current = { rest, low: 0, high: Number((size * 3).toPrecision(2)), step };
   }
   const { low, high, step } = range.current;
   const change = (/** @type {any} */ event) => {
