@@ -370,6 +370,26 @@ def test_the_list_of_traces_without_an_answer_moves_nothing(page: Any) -> None:
     expect(listed).to_be_hidden()
 
 
+def test_a_size_that_is_unknown_is_not_shown(page: Any) -> None:
+    search(page, NEAR)
+    open_first(page)
+    page.get_by_role("tab", name="nodes").click()
+    page.locator(".pattern tbody tr").first.click()
+    panel = page.locator(".panel.pattern")
+    expect(panel).to_contain_text(re.compile(r"size\s*\d+\.\d . \d+\.\d m"))
+    page.evaluate("""async () => {
+      const load = name => import(new URL(`static/js/${name}.js`, document.baseURI));
+      const {statesAt} = await load("data"), {open, paints, seq} = await load("state");
+      const {length} = statesAt(open.value.trace, Math.floor(seq.value)).columns;
+      length.fill(NaN);
+    }""")
+    page.locator(".scene").press(".")
+    expect(panel).not_to_contain_text("size")
+    expect(panel).to_contain_text("heading")
+    assert "NaN" not in panel.inner_text()
+    page.reload()
+
+
 def test_a_slider_is_of_the_number_in_the_text(page: Any) -> None:
     slider = page.get_by_label("Number under the cursor")
     search(page, "MATCH (e:Ego) WHERE e.speed > 30")
@@ -383,6 +403,24 @@ def test_a_slider_is_of_the_number_in_the_text(page: Any) -> None:
     page.get_by_role("button", name="sgstore", exact=True).click()
     page.locator(".card").first.wait_for()
     expect(slider).to_have_count(0)
+
+
+def test_a_camera_picture_of_an_earlier_frame_is_marked(page: Any) -> None:
+    search(page, NEAR)
+    open_first(page)
+    picture = page.locator(".camera canvas")
+    expect(picture).to_have_attribute("aria-busy", "false")
+    release = hold(page, "**/api/picture*")
+    for _ in range(30):
+        page.locator(".scene").press(".")
+    expect(picture).to_have_attribute("aria-busy", "true")
+    expect(picture).to_have_css("opacity", "0.35")
+    release()
+    expect(picture).to_have_attribute("aria-busy", "false")
+    expect(picture).to_have_css("opacity", "1")
+    at = re.search(r"#(\d+)", page.locator(".transport .time").inner_text())
+    assert at
+    expect(picture).to_have_attribute("data-frame", at[1])
 
 
 def test_cards_can_be_sorted_again_when_all_counts_are_in(page: Any) -> None:

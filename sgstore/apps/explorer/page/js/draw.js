@@ -164,7 +164,7 @@ function paintRings(ctx, states, look, ratio, ink) {
   ctx.globalAlpha = 1;
 }
 
-/** Width and height of a traffic light; m. @param {number} scale */
+/** Width and height of a traffic light; m. @param {number} scale @returns {[number, number]} */
 const lightSize = (scale) => [Math.max(2.6, 20 / scale) * 0.46, Math.max(2.6, 20 / scale)];
 
 /** How far the traffic lights of a frame stand aside, so that none covers another: row → m to the right.

@@ -38,6 +38,9 @@ function Camera() {
   arrived.value;
   const ahead = playing.value ? Math.max(1, Math.round(rate.value)) : 1;
   const picture = now && camera.value ? pictureAt(now.trace, camera.value, frame.value, ahead) : null;
+  // What plays is never quite in time: there, a picture is late if more than two pictures are missing.
+  const late = !picture?.failed && !(picture && frame.value - picture.seq <= (playing.value || live.value ? 2 * ahead
+    : 0));
   useLayoutEffect(() => {
     const ctx = canvas.current?.getContext("2d");
     if (!canvas.current || !ctx || !picture?.image) return;
@@ -54,7 +57,8 @@ function Camera() {
         onChange=${(/** @type {{target: HTMLInputElement}} */ e) => { camera.value = e.target.value; }}>
           ${about?.cameras.map((c) => html`<option>${c}</option>`)}</select>`
       : html`<span class="chip">${camera.value}</span>`}</div>
-    <canvas ref=${canvas} role="img" aria-label="Camera picture" data-frame=${picture?.seq}></canvas>
+    <canvas ref=${canvas} class=${picture?.failed ? "failed" : late ? "late" : ""} role="img" aria-busy=${late}
+      aria-label=${late ? "Camera picture of an earlier frame" : "Camera picture"} data-frame=${picture?.seq}></canvas>
     ${picture?.failed ? html`<div class="none">${reasonOf(picture.failed)}</div>` : null}
   </div>`;
 }
@@ -223,11 +227,15 @@ function NodePanel() {
   if (!now || node === null) return null;
   const row = states ? rowOf(states, node) : -1, c = states?.columns, ego = states ? egoRow(states) : -1;
   const light = row >= 0 && c && kindOf(c.kind[row]) === "traffic_light";
-  const about = row < 0 || !c ? [] : [light ? ["light", lightOf(c.light?.[row] ?? 0)]
-    : ["speed", `${c.speed[row].toFixed(2)} m/s`],
-    ["heading", `${((c.heading[row] * 180) / Math.PI).toFixed(1)}°`],
-    ["size", `${c.length[row].toFixed(1)} × ${c.width[row].toFixed(1)} m`],
-      ["place", `${placeOf(now.trace, c, row).map((v) => v.toFixed(2)).join(", ")} m`]];
+  /** A value in words, of numbers; none where one of them is unknown. */
+  const told = (/** @type {string} */ name, /** @type {number[]} */ values, /** @type {number} */ digits,
+    /** @type {string} */ between, /** @type {string} */ unit) => (values.every(Number.isFinite)
+    ? [[name, values.map((v) => v.toFixed(digits)).join(between) + unit]] : []);
+  const about = row < 0 || !c ? [] : [...(light ? [["light", lightOf(c.light?.[row] ?? 0)]]
+    : told("speed", [c.speed[row]], 2, "", " m/s")),
+    ...told("heading", [(c.heading[row] * 180) / Math.PI], 1, "", "°"),
+    ...told("size", [c.length[row], c.width[row]], 1, " × ", " m"),
+    ...told("place", placeOf(now.trace, c, row), 2, ", ", " m")];
   const has = (/** @type {string} */ name,
     /** @type {number} */ of) => series.value.some((one) => one.attribute === name && one.node === of);
   const other = ego >= 0 && c && c.node[ego] !== node ? c.node[ego] : undefined;
@@ -345,8 +353,8 @@ function Transport() {
       onClick=${() => { playing.value = false; open.value = null; }}>×</button>`}
     ${told ? html`<span class="gap" role="status">${gap?.failed
       ? html`<span>${failing > 0 ? `step ${failing > 1 ? `1 to ${failing}` : "1"} of ${of} holds · ` : null}
-        <b>${failing >= 0 ? `step ${failing + 1} of ${of} ` : null}fails</b> <code>${gap.failed}</code>${gap.found ? html` · found <code>${gap.found}</code>`
-      : null}</span>`
+        <b>${failing >= 0 ? `step ${failing + 1} of ${of} ` : null}fails</b> <code>${gap.failed}</code>
+        ${gap.found ? html` · found <code>${gap.found}</code>` : null}</span>`
       : told.error ? told.error.reason : "all of it holds in this frame"}
       ${(told.relax || []).map((/** @type {any} */ change) => html`<button class="small"
         onClick=${() => relax(change)}>${[...asked.value].slice(change.start,
