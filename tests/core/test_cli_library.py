@@ -59,6 +59,84 @@ def test_what_is_searched_by_its_own_words_is_among_the_best(name: str) -> None:
     assert place < 12
 
 
+@pytest.mark.parametrize(
+    ("sentence", "name"),
+    [
+        ("ego collides with another road user", "collision"),
+        ("the ego crashes into a car", "collision"),
+        ("ego hits a pedestrian", "collision"),
+        ("smallest distance to another vehicle, collision", "collision"),
+        ("time to collision below 2 seconds", "low_ttc"),
+        ("low time to collision with a pedestrian", "low_ttc"),
+        ("three persons near ego", "PedestrianCrossing"),
+        ("several pedestrians near", "PedestrianCrossing"),
+        ("many people crossing the street", "PedestrianCrossing"),
+        ("turns left", "starting_left_turn"),
+        ("ego turns left", "starting_left_turn"),
+        ("a vehicle turns left", "turns_left"),
+        ("ego turns right", "starting_right_turn"),
+        ("ego turns right at the intersection", "SignalizedJunctionRightTurn"),
+        ("pedestrian crosses in front of the ego", "crossing_pedestrian"),
+        ("a person walks across the road in front of my car", "crossing_pedestrian"),
+        ("vehicle cuts in closely", "cut_in"),
+        ("another car cuts in ahead of me", "cut_in"),
+        ("ego stands at red light", "waiting_at_red"),
+        ("waiting at a red traffic light", "waiting_at_red"),
+        ("car brakes hard in front of me", "lead_hard_braking"),
+        ("the leading vehicle brakes suddenly", "lead_hard_braking"),
+        ("ego brakes hard", "hard_braking"),
+        ("ego drives over red light", "red_light_running"),
+        ("ego drives over red light", "r_in2_red_light"),
+        ("vehicle runs a red light", "red_light_running"),
+        ("a bike is passed too closely", "close_pass_of_bicycle"),
+        ("ego overtakes a cyclist", "close_pass_of_bicycle"),
+        ("overtaking in the opposite lane", "overtaking_in_oncoming_lane"),
+        ("left turn with oncoming traffic", "unprotected_left_turn"),
+        ("ambulance behind the ego", "YieldToEmergencyVehicle"),
+        ("ego changes lane", "changing_lane"),
+        ("lane change without turn indicator", "lane_change_without_indicator"),
+        ("vehicle ignores the stop sign", "stop_sign_ignored"),
+        ("ego is stopped in the intersection", "stopped_in_junction"),
+        ("pedestrian hidden behind a parked car", "ParkingCrossingPedestrian"),
+        ("person suddenly becomes visible", "occlusion"),
+        ("truck follows too closely", "tailgated_by_truck"),
+        ("ego follows too close", "following_too_close"),
+        ("pedestrian on the road without crosswalk", "jaywalking"),
+        ("car drives against traffic", "against_traffic"),
+        ("ego exceeds the speed limit", "r_g3_speed_limit"),
+        ("almost a collision, near miss", "near_miss"),
+        ("a car comes towards me in my lane", "oncoming_in_lane"),
+        ("stops", "stops"),
+        ("vehicle starts", "starts"),
+        ("emergency vehicle with siren nearby", "emergency_vehicle_near"),
+        ("parked cars along the road", "parked_row"),
+        ("the ego is in a roundabout", "in_roundabout"),
+        ("two vehicles merge into one lane", "merge_conflict"),
+        ("ego drives on the oncoming lane to overtake", "overtaking_in_oncoming_lane"),
+        ("ego waits for pedestrians at a crosswalk", "waiting_for_pedestrian_to_cross"),
+        ("construction site in my lane", "ConstructionObstacle"),
+        ("door of a parked car opens", "VehicleOpensDoorTwoWays"),
+        ("traffic jam", "in_congestion"),
+        ("reversing car", "reversing"),
+        ("child runs onto the street", "walks_onto_road"),
+        ("ego follows the car ahead with less than one second", "following_too_close"),
+        ("cyclist crosses the intersection", "CrossingBicycleFlow"),
+        ("ego is surrounded by many vehicles", "near_multiple_vehicles"),
+    ],
+)
+def test_a_sentence_finds_its_pattern_among_the_first_three(sentence: str, name: str) -> None:
+    assert name in [one.name for one in search(sentence)[:3]]
+
+
+def test_rare_words_count_more_than_common_words() -> None:
+    common = search("the ego and a vehicle")
+    first, *_ = search("the ego and a vehicle in a lane of another, jaywalking")
+
+    assert first.name == "jaywalking"
+    assert first not in common[:3]
+    assert search("the of") == []
+
+
 def test_show_prints_a_query_that_can_be_asked(
     capsys: pytest.CaptureFixture[str], store: str, tmp_path: Path
 ) -> None:

@@ -3,32 +3,81 @@
 from __future__ import annotations
 
 import re
-from functools import cache, partial
-from itertools import takewhile
+from collections import Counter
+from functools import cache
+from math import log
 from typing import TYPE_CHECKING, Final
 
 from sgstore.lang.library._entries import NamedPattern, patterns
 from sgstore.model.vocabulary import LABEL_ALIASES
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Mapping
 
 _WORD: Final = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+")
 
-_SYNONYMS: Final = {
-    **LABEL_ALIASES,
-    **dict.fromkeys(("crash", "crashes", "crashed", "contact", "overlaps", "overlap"), "collision"),
-}
+_ENDING: Final = re.compile(r"(?<=...)(?:e?ly|ing|(?<!e)ed|es|(?<!s)s|ion|e)$")
+_DOUBLED: Final = re.compile(r"([bdgmnpt])\1$")
+"""Doubled letter before an ending: ``stopped``."""
 
-_STEM: Final = 4
-"""Smallest number of first letters that words of the same stem share: ``brakes``, ``braking``."""
+
+def _stem(word: str) -> str:
+    """Return a word without its ending: ``brak`` for ``brakes`` and ``braking``."""
+    stem = _ENDING.sub("", word)
+    return _DOUBLED.sub(r"\1", stem)
+
+
+_SYNONYMS: Final = {
+    _stem(word): [_stem(one) for one in meaning.split()]
+    for meaning, words in (
+        *((name, alias) for alias, name in LABEL_ALIASES.items()),
+        ("person", "persons people man woman child children"),
+        ("vehicle", "car automobile"),
+        ("bicycle", "bike cyclist bicyclist"),
+        ("truck", "lorry"),
+        ("ego", "i me my self"),
+        ("emergency", "ambulance siren"),
+        ("collision", "collide crash contact overlap hit touch"),
+        ("time collision", "ttc"),
+        ("several", "many multiple three four five crowd group"),
+        ("stop", "stand stood wait halt stationary static"),
+        ("start", "begin"),
+        ("near", "nearby nearest close closest among surrounded"),
+        ("low", "below under less small short"),
+        ("hard", "strong sudden abrupt heavy"),
+        ("brake", "decelerate deceleration"),
+        ("ahead", "front before"),
+        ("junction", "intersection crossroad"),
+        ("oncoming", "opposite opposing"),
+        ("slow", "creep"),
+        ("congestion", "jam"),
+        ("road", "street"),
+        ("hidden", "occlusion occluded"),
+        ("pass", "overtake"),
+        ("crosswalk", "zebra"),
+        ("no", "without"),
+        ("", "a an and are by into is its of that the to with"),
+    )
+    for word in words.split()
+}
+"""Stem of a synonym → stems that replace it. Function words have none."""
+
+_NAME, _SENTENCE, _REST = 4.0, 2.0, 1.0
+"""Weights of a word in the name, in the sentence, and in parameters, source and text."""
+
+_PREDICATE: Final = 0.8
+"""Factor for predicates, which are conditions of queries and not queries."""
+
+_RARE: Final = 0.1
+"""Largest share of the entries that have a rare word."""
 
 
 def search(text: str, kinds: Collection[str] = ()) -> list[NamedPattern]:
     """Return the patterns of the query library that match some words, best match first.
 
-    A word counts most in a name, then in a sentence, then in parameters, source and text. Words of one stem
-    match, and so do synonyms of a kind (``pedestrian``, ``person``).
+    A word that few entries have counts more than a common word, such as ``ego``. A word counts most in a
+    name, then in a sentence, then in parameters, source and text. Words of one stem match (``brakes``,
+    ``braking``), and so do synonyms (``pedestrian``, ``person``).
 
     Parameters
     ----------
@@ -40,43 +89,46 @@ def search(text: str, kinds: Collection[str] = ()) -> list[NamedPattern]:
     Returns
     -------
     list of NamedPattern
-        Entries with at least one word, sorted by number of words, then by weight.
+        Entries with at least one word: first those whose name has exactly the words, then those with all
+        rare words in name and sentence, then those of the largest weight.
     """
-    wanted = list(dict.fromkeys(_words(text)))
-    ranks: list[tuple[int, int, NamedPattern]] = []
+    places, rarity = _index()
+    wanted = {word for word in _words(text) if word in rarity}
+    rare = {word for word in wanted if rarity[word] >= -log(_RARE)}
+    ranks: list[tuple[bool, bool, float, NamedPattern]] = []
     for entry in patterns().values():
-        if kinds and entry.kind not in kinds:
+        place = places[entry.name]
+        common = wanted & place.keys()
+        if not common or (kinds and entry.kind not in kinds):
             continue
-        weights = [max(map(partial(_weight, word), _places(entry.name))) for word in wanted]
-        ranks.append((sum(map(bool, weights)), sum(weights), entry))
-    ranks.sort(key=lambda rank: (-rank[0], -rank[1]))
-    return [entry for words, _, entry in ranks if words]
+        weight = sum(rarity[word] * place[word] for word in common)
+        said = {word: rarity[word] * one for word, one in place.items() if one > _REST}
+        covered = sum(said[w] for w in said.keys() & wanted) / sum(said.values())
+        weight *= (1 + covered) * (_PREDICATE if entry.kind == "predicate" else 1)
+        named = wanted == {word for word, one in place.items() if one == _NAME}
+        rares = all(place.get(word, 0) > _REST for word in rare)
+        ranks.append((named, rares, weight, entry))
+    ranks.sort(key=lambda rank: rank[:3], reverse=True)
+    return [entry for *_, entry in ranks]
 
 
 @cache
-def _places(name: str) -> tuple[tuple[int, frozenset[str]], ...]:
-    """Return the words of a library pattern, with weights: words of the name count most."""
-    entry = patterns()[name]
-    parameters = " ".join(f"{p.name} {p.meaning}" for p in entry.parameters.values())
-    rest = f"{parameters} {entry.source} {entry.kind} {entry.query}"
-    texts = (4, entry.name), (2, entry.sentence), (1, rest)
-    return tuple((weight, frozenset(_words(text))) for weight, text in texts)
+def _index() -> tuple[Mapping[str, Mapping[str, float]], Mapping[str, float]]:
+    """Return the weight of each word per entry, and the rarity of each word in the library."""
+    places: dict[str, dict[str, float]] = {}
+    for entry in patterns().values():
+        parameters = " ".join(f"{p.name} {p.meaning}" for p in entry.parameters.values())
+        rest = f"{parameters} {entry.source} {entry.kind} {entry.query}"
+        places[entry.name] = {
+            **dict.fromkeys(_words(rest), _REST),
+            **dict.fromkeys(_words(entry.sentence), _SENTENCE),
+            **dict.fromkeys(_words(entry.name), _NAME),
+        }
+    entries = Counter(word for place in places.values() for word in place)
+    return places, {word: log((len(places) + 1) / count) for word, count in entries.items()}
 
 
 def _words(text: str) -> list[str]:
-    """Split a text into lower-case words, such as ``cut`` and ``in``. Synonyms are replaced."""
-    return [_SYNONYMS.get(word, word) for word in map(str.lower, _WORD.findall(text))]
-
-
-def _weight(word: str, place: tuple[int, frozenset[str]]) -> int:
-    weight, words = place
-    return weight if word in words or any(_of_one_stem(word, one) for one in words) else 0
-
-
-def _of_one_stem(a: str, b: str) -> bool:
-    common = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(a, b, strict=False)))
-    return common >= _STEM and max(len(a), len(b)) - common <= _ENDING
-
-
-_ENDING: Final = 3
-"""Largest number of letters of a word ending: ``ing``."""
+    """Split a text into stems of lower-case words. Synonyms are replaced."""
+    stems = [_stem(word.lower()) for word in _WORD.findall(text)]
+    return [one for stem in stems for one in _SYNONYMS.get(stem, [stem])]
