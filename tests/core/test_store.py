@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -338,7 +339,7 @@ def test_many_traces_are_removed_in_several_transactions(
     store = StoreFile.create(tmp_path / "s.db")
     names = [publish(store, RandomTrace(n, path=f"trace {n}")) for n in range(5)]
     before = store.stamp
-    monkeypatch.setattr("sgstore.store._file._AT_ONCE", 2)
+    monkeypatch.setattr(sys.modules[StoreFile.__module__], "_AT_ONCE", 2)
 
     gone = store.remove(*names[:4])
 

@@ -65,7 +65,8 @@ export function Status() {
       : told.rows ? html`<span><b>${told.rows.length.toLocaleString("en")}</b> rows</span>`
       : html`<span><b>${found.toLocaleString("en")}</b> ${wordOf(found)} in ${many} ${many === 1 ? "trace"
         : "traces"}, ${frames.toLocaleString("en")} frames</span>`}
-    ${hidden.value && !told.rows ? html`<span class="note">${hidden.value.toLocaleString("en")} ${wordOf(hidden.value)}${" "}
+    ${hidden.value && !told.rows ? html`<span class="note">
+      ${hidden.value.toLocaleString("en")} ${wordOf(hidden.value)}${" "}
       in other traces</span><button class="small" onClick=${() => { filter.value = { trace: "", map: "" }; }}>
       show all</button>` : null}
     ${told.ms && !offline.value ? html`<span class="faint">${Math.round(told.ms)} ms</span>` : null}
