@@ -144,6 +144,9 @@ DRIVING: Final = frozenset(
 )
 """Types of lanes for motor traffic, as in ASAM OpenDRIVE 1.4 to 1.8."""
 
+NOT_FOR_MOTOR_TRAFFIC: Final = frozenset({"pedestrian", "bicycle"})
+"""Subkinds of traffic lights that control no lane for motor traffic, even if a file assigns one to them."""
+
 TRAFFIC: Final = DRIVING | {"biking", "special1", "special2", "special3"}
 """Types of lanes whose direction of travel matters for neighbouring lanes."""
 

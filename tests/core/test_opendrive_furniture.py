@@ -350,6 +350,19 @@ def test_footprints_touch_crosswalks_on_their_storey() -> None:
     assert {road_map.nodes.name[-1 - n] for n in nodes} == {"z"}
 
 
+def test_a_light_for_pedestrians_controls_no_lane_even_if_its_validity_names_lanes() -> None:
+    validity = element("validity", fromLane=-1, toLane=1)
+    lights = [
+        element("signal", validity, id=name, s=5, t=0, type=code, dynamic="yes", orientation="+")
+        for name, code in (("car", "1000001"), ("walk", "1000002"))
+    ]
+    road_map = read_map(a_map(road_with("".join(lights))), "map")
+
+    assert {"car", "walk"} <= set(road_map.nodes.name)
+    assert len(road_map.lanes_of_signal("car")) > 0
+    assert len(road_map.lanes_of_signal("walk")) == 0
+
+
 def test_nodes_come_in_their_order_and_their_ids_run_down_from_minus_one() -> None:
     outline = element("outline", corners("cornerLocal", *SQUARE))
     objects = thing("tree", type="tree") + thing("zebra", outline, type="crosswalk")

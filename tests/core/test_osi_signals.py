@@ -142,6 +142,17 @@ def test_a_store_knows_which_light_controls_the_lane_of_the_ego(tmp_path: Path) 
     assert [row[-1] for row in found] == ["200"] * 3
 
 
+def test_lights_for_pedestrians_control_no_lane_for_motor_traffic(tmp_path: Path) -> None:
+    lights = [bulb(200, (99, -6, 5), (1,)), bulb(201, (99, 6, 5), (1,))]
+    lights[1].classification.icon = 17  # ICON_DONT_WALK
+    ingest(tmp_path / "s.db", [record(tmp_path / "a.mcap", roads.two_way(), lights)])
+
+    store = sgstore.open(tmp_path / "s.db")
+    for relation in ("controlsTrafficOf", "mayAffect"):
+        found = store.find(f"MATCH (s:TrafficLight)-[:{relation}]->(:Lane) RETURN s.ident")
+        assert {row[-1] for row in found} == {"200"}
+
+
 def test_opendrive_counts_before_what_lights_are_assigned_to(tmp_path: Path) -> None:
     things = [bulb(200, (99, -6, 5), (1,))]
     road_map = a_map(a_road("1", line(9.0)))
@@ -179,10 +190,10 @@ def test_the_lanes_that_esmini_assigns_are_those_of_the_signals_of_its_map(
 
     theirs, ours = applies(whole), applies(bare)
 
-    assert sum(map(bool, theirs.values())) == 5
-    assert {ident: set(lanes) for ident, lanes in ours.items()} == {
-        ident: set(lanes) for ident, lanes in theirs.items()
-    }
+    # A light and a sign have lanes in the map. Two lights for pedestrians have none there.
+    controlled = {ident: set(lanes) for ident, lanes in theirs.items() if lanes}
+    assert len(controlled) == 2
+    assert {ident: set(ours[ident]) for ident in controlled} == controlled
 
 
 # The text of a map --------------------------------------------------------------------------------

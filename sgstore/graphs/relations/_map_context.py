@@ -25,7 +25,13 @@ from sgstore.graphs.relations._scene import (
 from sgstore.graphs.relations._signal_reach import SignalReach
 from sgstore.maps.roads import OFF_ROAD, LaneHits, RoadMap
 from sgstore.model.noise import DeadBand
-from sgstore.model.vocabulary import DRIVING, RELATION_CODE, VEHICLES, are_entities
+from sgstore.model.vocabulary import (
+    DRIVING,
+    NOT_FOR_MOTOR_TRAFFIC,
+    RELATION_CODE,
+    VEHICLES,
+    are_entities,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -125,7 +131,7 @@ class LaneContact:
             column = self._column((is_signal, ref), place)
             if column is not None:
                 twins.append((node, column))
-            if is_signal:
+            if is_signal and entities.subkind[row] not in NOT_FOR_MOTOR_TRAFFIC:
                 controls += [(node, lane) for lane in self._map.lanes_of_signal(ref).tolist()]
                 affects += [(node, lane) for lane in self._reach.of(ref, place).tolist()]
         self._twins = _appended(self._twins, twins)

@@ -156,6 +156,8 @@ _LIGHT: Final = re.compile(r"10000(0[1-9]|1\d|2\d)$")
 """Type codes of traffic lights for the country ``OpenDRIVE``."""
 _NOT_LIGHTS: Final = {"1000003", "1000004"}
 """Type codes of painted crossings for people and bicycles, which are not traffic lights."""
+_PEDESTRIAN_LIGHT: Final = "1000002"
+"""Type code of a light for pedestrians. Its validity names the lanes that they cross, and it controls none."""
 _STOP_LINE: Final = "294"
 """Type code of a stop line in StVO (Germany), which maps of other countries also use."""
 _SPEED_OBJECT: Final = re.compile(r"speed_(\d+(?:\.\d+)?)", re.IGNORECASE)
@@ -346,7 +348,10 @@ def _elements(
     reach.doubts.kinds = dict(zip(ids, kinds, strict=True))
     referred = _referred(document, reach)
     lanes: list[Stops] = []
-    for row, name in zip(rows.tolist(), ids, strict=True):
+    for row, name, code in zip(rows.tolist(), ids, codes, strict=True):
+        if code == _PEDESTRIAN_LIGHT:
+            lanes.append(frozenset())
+            continue
         place = int(road[row]), float(s[row])
         own = _stops(reach.valid((kind, row, name), place), place)
         lanes.append(own | referred.get(name, frozenset()))
