@@ -61,7 +61,7 @@ def test_red_phases_are_those_of_the_lights(store: Store) -> None:
     told = {(who(p, "t"), seq) for p in phases for seq in range(p.start_seq, p.end_seq + 1)}
 
     assert {p.trace for p in phases} == {"traffic_lights"}
-    assert {who(p, "t") for p in phases} == {f"traffic_light {number}" for number in (5, 6, 7)}
+    assert {who(p, "t") for p in phases} == {"traffic_light 5"}  # 6 and 7 are for pedestrians
     assert told == {tuple(row) for row in rows.values}
 
 
@@ -95,6 +95,33 @@ def test_the_ego_waits_at_red_where_there_are_lights(store: Store) -> None:
     (waiting,) = found(store, "waiting_at_red")
 
     assert waiting.trace == "traffic_lights"
+
+
+def test_red_lights_for_pedestrians_do_not_hold_the_ego(store: Store) -> None:
+    assert found(store, "red_light_running") == []
+    verdicts = store.check(patterns()["r_in2_red_light"].text)
+    assert {v.trace: v.verdict for v in verdicts}["traffic_lights"] == "true"
+
+
+def test_red_lights_of_lanes_in_a_junction_hold_vehicles_before_it(
+    data: Path, tmp_path: Path
+) -> None:
+    """Light 33 (signal 367 of road 6, referred to by roads 93 and 108) is red until 12 s."""
+    ingest(tmp_path / "a.sgstore", [data / "traces" / "carla" / "Town01.carla.mcap"])
+    town = Store(tmp_path / "a.sgstore")
+
+    runs = {(who(r, "x"), who(r, "t"), r.start) for r in found(town, "red_light_running")}
+    # From the poses of the messages: when each front passes the end of its lane (CARLA, lights 955 and 957).
+    assert runs == {
+        ("motorcycle 47", "traffic_light 33", 1.3),
+        ("car 36", "traffic_light 33", 4.1),
+        ("car 52", "traffic_light 33", 6.4),
+        ("car 53", "traffic_light 33", 9.4),
+        ("car 49", "traffic_light 35", 5.2),
+        ("car 39", "traffic_light 35", 8.9),
+    }
+    (verdict,) = town.check(patterns()["r_in2_red_light"].text)
+    assert verdict.verdict == "false"
 
 
 def test_people_who_walk_on_the_road_are_found_by_name(store: Store) -> None:

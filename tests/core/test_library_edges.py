@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 from library_edges import COLLISIONS, EDGES, RULES, Edge
-from library_scenes import SCENES
-from scenes import store_of
+from library_scenes import PHASES, RED, SCENES, on
+from scenes import crossroads, store_of
 from thorough import some
 
 from sgstore.lang.library import patterns
@@ -110,3 +110,23 @@ def test_the_deeper_collision_violates_a_rule_about_contact_by_more(
     assert max(values) < -0.01
     told = {verdicts[trace].robustness.condition for trace in scenes}
     assert all(condition.startswith("clearance(") for condition in told), told
+
+
+@pytest.mark.parametrize(
+    ("shows", "ways", "held"),
+    [("red", "nesw", True), ("green", "nesw", False), ("red", "w", False)],
+)
+def test_lights_of_lanes_in_a_junction_hold_if_they_stop_every_way_on(
+    tmp_path: Path, shows: str, ways: str, held: bool
+) -> None:
+    road = crossroads("light", inside=ways)
+    drives, waits = (
+        on(scene.with_actor("light-s", shows=[(0, shows)]), road) for scene in (RED, PHASES)
+    )
+    store = store_of(tmp_path / "a.sgstore", {"drives": [drives], "waits": [waits]})
+
+    for name, trace in (("red_light_running", "drives"), ("waiting_at_red", "waits")):
+        found = {i.trace for i in store.find(patterns()[name].text).intervals()}
+        assert found == ({trace} if held else set())
+    verdict = checked(store, "r_in2_red_light")["drives"].verdict
+    assert verdict == ("false" if held else "true")

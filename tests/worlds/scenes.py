@@ -222,16 +222,17 @@ MOUTH, NEAR, FAR = 12.0, 40.0, 140.0
 
 
 @cache
-def crossroads(signs: str = "", lanes: int = 1) -> RoadMap:
+def crossroads(signs: str = "", lanes: int = 1, inside: str = "") -> RoadMap:
     """Four arms of so many lanes to each side, and all ways through.
 
     ``signs``: ``light`` or ``stop`` at the end of each lane that leads in, named ``light-s`` and so on.
+    ``inside``: they control the ways to these arms instead, as in the towns of CARLA.
     """
     parts, connections = [], []
     for number, (arm, turn) in enumerate(ARMS.items(), start=1):
-        parts.append(_arm(arm, number, turn, signs, lanes))
+        parts.append(_arm(arm, number, turn, signs, lanes, bool(inside)))
     for number, (come, go) in enumerate(((a, b) for a in ARMS for b in ARMS if a != b), start=10):
-        parts.append(_way(number, come, go, lanes))
+        parts.append(_way(number, come, go, lanes, signs if go in inside else ""))
         links = (element("laneLink", **{"from": i, "to": -i}) for i in range(1, lanes + 1))
         connections.append(
             element(
@@ -251,7 +252,7 @@ def _number(arm: str) -> str:
     return str(1 + [*ARMS].index(arm))
 
 
-def _arm(arm: str, number: int, turn: float, signs: str, lanes: int) -> str:
+def _arm(arm: str, number: int, turn: float, signs: str, lanes: int, inside: bool) -> str:
     def lanes_of(**links: int) -> list[str]:
         made = [lane(0, mark("broken"))]
         for i in range(1, lanes + 1):
@@ -265,6 +266,7 @@ def _arm(arm: str, number: int, turn: float, signs: str, lanes: int) -> str:
     code = {"light": "1000001", "stop": "206", "": ""}[signs]
     signal = element(
         "signal",
+        element("validity", fromLane=0, toLane=0) if inside else "",
         id=f"{signs}-{arm}",
         s=0.5,
         t=LANE * lanes + 1,
@@ -283,7 +285,7 @@ def _arm(arm: str, number: int, turn: float, signs: str, lanes: int) -> str:
     )
 
 
-def _way(number: int, come: str, go: str, lanes: int) -> str:
+def _way(number: int, come: str, go: str, lanes: int, signs: str) -> str:
     """The road from an arm to another, its reference line between the lanes of both directions."""
     at, turned = np.radians(ARMS[come]), (ARMS[go] - ARMS[come]) % 360
     pose = {"x": MOUTH * np.cos(at), "y": MOUTH * np.sin(at), "hdg": at + np.pi}
@@ -296,7 +298,16 @@ def _way(number: int, come: str, go: str, lanes: int) -> str:
     made = [lane(-i, width(LANE), before=i, after=-i) for i in range(1, lanes + 1)]
     links = link("predecessor", "road", _number(come), "start")
     links += link("successor", "road", _number(go), "start")
-    return a_road(str(number), plan, sections=section(lane(0), *made), links=links, junction="9")
+    sections = section(lane(0), *made)
+    signals = element("signalReference", id=f"{signs}-{come}", s=0.5, t=0, orientation="+")
+    return a_road(
+        str(number),
+        plan,
+        sections=sections,
+        links=links,
+        junction="9",
+        signals=signals if signs else "",
+    )
 
 
 def through(come: str, go: str, lane_number: int = 1, out: int = 0) -> tuple[Point, ...]:
