@@ -541,6 +541,7 @@ def test_words_and_library(page: Page) -> None:
     assert page.get("/api/search", text="someone brakes hard").json()[0] in {
         "hard_brake",
         "brakes_hard",
+        "hard_braking",
     }
     near = page.post("/api/nearest", text="MATCH (e:Ego) WHERE e.speed > 60").json()
     assert near["failed"] == "e.speed > 60"
