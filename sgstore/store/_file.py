@@ -248,14 +248,6 @@ class StoreFile:
                     size -= sum(one.nbytes for one in kept.pop(next(iter(kept))).values())
             return found
 
-    def numbers(self, sql: str) -> dict[str, NDArray[Any]]:
-        """Run a trusted SQL statement without parameters, and return its columns of numbers.
-
-        Floats are float64 with NaN for NULL, as are integers with NULL.
-        """
-        with self.answered(lambda at, _: rows.numbers(at, sql), sql, []) as found:
-            return found
-
     def table(
         self, sql: str, parameters: Parameters | None = None, *, given: Iterable[Given] = ()
     ) -> Any:

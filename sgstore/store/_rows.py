@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import duckdb
-import numpy as np
 
 from sgstore.base.json_text import shortest
 from sgstore.base.quoting import quoted
@@ -22,6 +21,7 @@ from sgstore.store._table_files import ParquetTable, relation_of, write_csv
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
+    import numpy as np
     from duckdb import DuckDBPyConnection
     from numpy.typing import NDArray
 
@@ -374,26 +374,6 @@ def arrays(
         return connection.execute(sql, given).fetchnumpy()
 
     return interruptible(connection, fetched)
-
-
-def numbers(connection: DuckDBPyConnection, sql: str) -> dict[str, NDArray[Any]]:
-    """Run a trusted SQL statement, and return its columns of numbers.
-
-    Floats are float64 with NaN for NULL, as are integers with NULL.
-    """
-
-    def fetched() -> dict[str, NDArray[Any]]:
-        found = connection.execute(sql).fetchnumpy()
-        return {name: _plain(values) for name, values in found.items()}
-
-    return interruptible(connection, fetched)
-
-
-def _plain(values: NDArray[Any]) -> NDArray[Any]:
-    """Return a column as numbers. Missing values are NaN."""
-    if np.ma.isMaskedArray(values):
-        return np.ma.filled(values.astype(np.float64), np.nan)
-    return values.astype(np.float64, copy=False) if values.dtype.kind == "f" else values
 
 
 def _columns(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> list[list[Any]]:

@@ -8,7 +8,7 @@ view ``world_criticality``: the same expressions, with cosines and sines of the 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -156,19 +156,21 @@ class _EgoPairs:
 
     @classmethod
     def _read(cls, file: StoreFile, frames: Ints, sql: str) -> _EgoPairs:
-        found: dict[str, Any] = file.numbers(
-            f"{sql} AND frame_id BETWEEN {int(frames[0])} AND {int(frames[-1])}"
+        found = file.arrays(
+            f"{sql} AND frame_id BETWEEN ? AND ?", [int(frames[0]), int(frames[-1])], plain=True
         )
-        if not found:
-            found = dict.fromkeys(("frame_id", "node_id", "is_ego"), np.zeros(0, np.int64))
-        ids, node, is_ego = (found.pop(name) for name in ("frame_id", "node_id", "is_ego"))
-        is_ego = is_ego.astype(np.bool_)
+        keys = (np.ma.getdata(found.pop(name)) for name in ("frame_id", "node_id", "is_ego"))
+        ids, node, is_ego = (one.astype(of) for one, of in zip(keys, "qq?", strict=True))
         place = np.minimum(np.searchsorted(frames, ids), len(frames) - 1)
         here = frames[place] == ids
         ego = np.full(len(frames), -1)
         ego[place[is_ego & here]] = np.flatnonzero(is_ego & here)
         other = np.flatnonzero(here & ~is_ego & (ego[place] >= 0))
-        columns = {**found, "node_id": node.astype(np.float64)}
+        columns = {
+            name: np.ma.filled(np.ma.asarray(values, np.float64), np.nan)
+            for name, values in found.items()
+        }
+        columns["node_id"] = node.astype(np.float64)
         marks = {name: np.zeros(len(other)) for name in MARKS}
         return cls(place[other], node[other], (ego[place[other]], other), columns, marks)
 
