@@ -520,7 +520,7 @@ class Matches(Tabular):
         108
         """
         with self._compiled() as compiled:
-            if compiled.limited_to_frames is not None or compiled.drops_intervals:
+            if compiled.drops_frames:
                 return len({row[0] for row in self._frames()})
             many = self._file.rows(**self._asked(compiled.count())).values[0][0]
             self._some = many > 0
@@ -747,7 +747,7 @@ class Matches(Tabular):
         """
         start, end = round(before * 1e9), round(after * 1e9)
         with self._compiled() as compiled:
-            if compiled.limited_to_frames is not None or compiled.drops_intervals:
+            if compiled.drops_frames:
                 frames = ((row[1], row[-1]) for row in self._frames())
                 around = (Clip(trace, time - start, time + end) for trace, time in frames)
                 clips = sorted(around, key=lambda clip: (natural(clip.trace), clip.start_ns))

@@ -650,7 +650,7 @@ class CollectionMatches(TemporalMatches):
 
     def count(self) -> int:
         """Return the number of distinct frames with a match."""
-        if self._ready.limited_to_frames is not None or self._ready.drops_intervals:
+        if self._ready.drops_frames:
             return len({row[0] for row in self._frames()})
         with working_folder("classes") as folder:
             bundles = self._whole.may_answer(self._ready)

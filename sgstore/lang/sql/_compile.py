@@ -216,6 +216,11 @@ class Compiled:
         return result.form == "intervals" and result.chooses and not result.aggregated
 
     @property
+    def drops_frames(self) -> bool:
+        """True if a limit or a condition on rows or intervals drops matching frames."""
+        return self.limited_to_frames is not None or self.drops_intervals
+
+    @property
     def listed(self) -> Compiled | None:
         """Return a copy for the same rows, with the nodes of each match; see :func:`listed_matches`."""
         query, layout = self.query, self.layout
