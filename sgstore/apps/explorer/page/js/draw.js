@@ -2,7 +2,7 @@
 // Scenes on a canvas, from columns: the road map, what stands and what moves, what is matched.
 import { computed } from "../vendor/core.js";
 import { kindOf, lightOf, mapOf, stillOf } from "./data.js";
-import { placed } from "./labels.js";
+import { meet, placed } from "./labels.js";
 import { paints, traces } from "./state.js";
 
 /** @typedef {import("./data.js").States} States */
@@ -170,17 +170,16 @@ const lightSize = (scale) => [Math.max(2.6, 20 / scale) * 0.46, Math.max(2.6, 20
 /** How far the traffic lights of a frame stand aside, so that none covers another: row → m to the right.
  * @param {Columns} c @param {number} from @param {number} to @param {Look} look */
 export function lightsAside(c, from, to, look) {
-  const [wide = 0, high = 0] = lightSize(look.scale), place = axes(look), aside = new Map();
-  /** @type {[number, number][]} */
+  const [wide, high] = lightSize(look.scale), place = axes(look), aside = new Map();
+  /** @type {import("./labels.js").Box[]} */
   const taken = [];
   for (let i = from; i < to; i++) {
     if (kindOf(c.kind[i]) !== "traffic_light") continue;
     const { x, y } = place.transformPoint({ x: c.x[i], y: c.y[i] });
-    let right = 0;
-    while (taken.some(([u, v]) => Math.abs(u - x - right * look.scale) < wide * look.scale
-      && Math.abs(v - y) < high * look.scale)) right += wide * 1.1;
-    taken.push([x + right * look.scale, y]);
-    aside.set(i, right);
+    const box = { x, y, wide: wide * look.scale, high: high * look.scale };
+    while (taken.some((one) => meet(box, one))) box.x += box.wide * 1.1;
+    taken.push(box);
+    aside.set(i, (box.x - x) / look.scale);
   }
   return aside;
 }
