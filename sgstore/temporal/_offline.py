@@ -60,7 +60,7 @@ if TYPE_CHECKING:
 
 
 REMEDY: Final = (
-    "give each node a label, such as (v:Vehicle), an edge to another node, or a condition"
+    "restrict the nodes: add a label, an edge between them, or a condition, such as (v:Vehicle)"
 )
 """Remedy for a query with too many combinations of nodes."""
 
