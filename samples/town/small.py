@@ -27,7 +27,7 @@ def write(source: Path, target: Path) -> None:
         reader = make_reader(stream, validate_crcs=True)
         header = reader.get_header()
         writer = Writer(
-            out, chunk_size=1 << 20, compression=CompressionType.ZSTD, enable_data_crcs=True
+            out, chunk_size=4 << 20, compression=CompressionType.ZSTD, enable_data_crcs=True
         )
         writer.start(header.profile, header.library)
         for metadata in reader.iter_metadata():
