@@ -73,6 +73,8 @@ def test_horizon_of_quantified_entities(formula: str, metres: float) -> None:
         ("CHECK ALWAYS COUNT {(v:Vehicle) WHERE dist(ego, v) < 30} < 2", 30, 0),
         ("CHECK ALWAYS MIN {(v:Vehicle) WHERE dist(ego, v) < 30 | v.speed} < 2", 30, 30),
         ("CHECK ALWAYS NOT red_for(ego)", 200, 0),
+        ("CHECK ALWAYS (stopped(ego) IMPLIES red_for(ego))", 0, 200),
+        ("CHECK ALWAYS NOT EXISTS {(l:Lane) WHERE red_ahead(l)}", math.inf, 0),
         ("USING RANGE 80 CHECK FORALL (v:Vehicle) ALWAYS v.speed < 50", 80, 0),
         ("USING RANGE 80 CHECK FORALL (v:Vehicle) ALWAYS dist(ego, v) > 5", 5, 0),
     ],

@@ -170,10 +170,21 @@ class _Missed:
 
 @dataclass(slots=True)
 class _Looking:
-    """Analysis of a check: how far from the ego its variables can be, and the greatest speed of vehicles."""
+    """Analysis of a check.
+
+    Attributes
+    ----------
+    known : dict of str to float
+        Variable → largest distance from the ego; m.
+    speed : float
+        Greatest speed of vehicles; m/s.
+    joined : frozenset of str
+        Variables that edges connect to one whose distance is limited.
+    """
 
     known: dict[str, float]
     speed: float
+    joined: frozenset[str] = frozenset()
 
     def blocks(  # noqa: C901, PLR0912 - a case each
         self, formula: Bound, *, up: bool = True
@@ -222,7 +233,9 @@ class _Looking:
                 reach = self.in_scope(scope, key).reach if moves else 0.0
                 yield _Missed(node.kinds.other, reach, not up, up)
         inner = _Looking(
-            self.known | {key: self.in_scope(scope, key).reach for key in scope.nodes}, self.speed
+            self.known | {key: self.in_scope(scope, key).reach for key in scope.nodes},
+            self.speed,
+            self.joined.union(key for key in scope.nodes if self._is_joined(scope, key)),
         )
         for part in block.inside:
             yield from inner.blocks(part, up=up)
@@ -238,11 +251,28 @@ class _Looking:
                 other = next(iter(ends - {key}), key)
                 reach = max(LINKS[name] for name in edge.relations)
                 found = found.both(_Place(reach + self.known.get(other, math.inf)))
-        if _joined(scope, key, self.known):
+        if self._is_joined(scope, key):
             found = found.both(_Place(lanes=True))
             if scope.kinds(key).every <= frozenset(SIGNALS):
                 found = found.both(_Place(WAITING))
         return found
+
+    def _is_joined(self, scope: Scope, key: str) -> bool:
+        """True if edges connect a node of a pattern to another one whose distance from the ego is limited."""
+        reached, grown = {key}, True
+        while grown:
+            fresh = {
+                end
+                for edge in scope.edges
+                if {edge.src, edge.dst} & reached
+                for end in (edge.src, edge.dst)
+            } - reached
+            reached |= fresh
+            grown = bool(fresh)
+        return any(
+            other in self.joined or self.known.get(other, math.inf) < math.inf
+            for other in reached - {key}
+        )
 
     def place(  # noqa: PLR0911 - a case each
         self, formula: Bound, key: str, *, wanted: bool, later: bool = False
@@ -346,21 +376,6 @@ def _any(places: list[_Place]) -> _Place:
     for one in places[1:]:
         found = found.either(one)
     return found
-
-
-def _joined(scope: Scope, key: str, known: Mapping[str, float]) -> bool:
-    """True if edges of a pattern connect a node to another node whose distance from the ego is limited."""
-    reached, grown = {key}, True
-    while grown:
-        fresh = {
-            end
-            for edge in scope.edges
-            if {edge.src, edge.dst} & reached
-            for end in (edge.src, edge.dst)
-        } - reached
-        reached |= fresh
-        grown = bool(fresh)
-    return any(known.get(other, math.inf) < math.inf for other in reached - {key})
 
 
 _COMPLEMENT: Final = {"<": ">=", "<=": ">", ">": "<=", ">=": "<", "=": "<>", "<>": "="}
