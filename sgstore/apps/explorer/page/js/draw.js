@@ -150,7 +150,7 @@ function paintRings(ctx, states, look, ratio, ink) {
   ctx.strokeStyle = ctx.fillStyle = ink.faint;
   ctx.lineWidth = 0.8;
   ctx.globalAlpha = 0.55;
-  ctx.setLineDash([2, 4]);
+  ctx.setLineDash([4, 14]); // the time of a picture grows with the number of dashes
   ctx.font = "10.5px system-ui, sans-serif";
   ctx.textBaseline = "alphabetic";
   for (const far of [10, 20, 50, 100, 200].filter((m) => m * look.scale > 45
@@ -234,8 +234,8 @@ export function legendOf(trace, states) {
 
 /** @param {CanvasRenderingContext2D} ctx @param {Columns} c @param {number} i @param {number} scale
  * @param {Inks} ink @param {{marked: Set<number>, lit: Set<number>, chosen?: number | null, small?: boolean}} what
- * @param {number} turn @param {number} aside of a traffic light */
-function paintEntity(ctx, c, i, scale, ink, what, turn, aside) {
+ * @param {number} turn @param {number} aside of a traffic light @param {Path2D} arrows gets one to the end ahead */
+function paintEntity(ctx, c, i, scale, ink, what, turn, aside, arrows) {
   const kind = kindOf(c.kind[i]), node = c.node[i], ego = c.ego ? c.ego[i] : 0;
   const least = (what.marked.has(node) ? 7 : 3.5) / scale;
   const length = Math.max(c.length[i] || 0.5, least), width = Math.max(c.width[i] || 0.5, least * 0.7);
@@ -264,15 +264,14 @@ function paintEntity(ctx, c, i, scale, ink, what, turn, aside) {
     ctx.strokeStyle = ink.ink;
     ctx.stroke();
   }
-  if (width * scale > 7 && length > width && !glyph && !SCENERY.has(kind)) { // which end is ahead
-    ctx.fillStyle = "rgba(255,255,255,.75)";
-    ctx.beginPath();
-    ctx.moveTo(length * 0.42, 0);
-    ctx.lineTo(length * 0.18, width * 0.32);
-    ctx.lineTo(length * 0.18, -width * 0.32);
-    ctx.fill();
-  }
   ctx.restore();
+  if (width * scale > 7 && length > width && !glyph && !SCENERY.has(kind)) {
+    const cos = Math.cos(heading), sin = Math.sin(heading);
+    [[0.42 * length, 0], [0.18 * length, 0.32 * width], [0.18 * length, -0.32 * width]].forEach(([ahead = 0, left = 0], k) => {
+      const x = c.x[i] + ahead * cos - left * sin, y = c.y[i] + ahead * sin + left * cos;
+      if (k) arrows.lineTo(x, y); else arrows.moveTo(x, y);
+    });
+  }
 }
 
 /** The first row of a frame that has a value; -1: none. @param {States} states @param {number} value
@@ -326,16 +325,18 @@ export function paintScene(ctx, trace, states, look, ratio, what) {
   if (states && !what.small) paintRings(ctx, states, look, ratio, ink);
   ctx.setTransform(axes(look, ratio));
   const reach = Math.hypot(look.width, look.height) / look.scale / 2 + 12;
-  const still = stillOf(trace)?.columns;
+  const still = stillOf(trace)?.columns, arrows = new Path2D();
   for (const [c, from, to] of [[still, 0, still?.node?.length || 0],
     [states?.columns, states?.from || 0, states?.to || 0]]) {
     if (!c) continue;
     const aside = what.small ? null : lightsAside(c, from, to, look);
     for (let i = from; i < to; i++) {
       if (Math.abs(c.x[i] - look.x) > reach || Math.abs(c.y[i] - look.y) > reach) continue;
-      paintEntity(ctx, c, i, look.scale, ink, what, look.turn, aside?.get(i) || 0);
+      paintEntity(ctx, c, i, look.scale, ink, what, look.turn, aside?.get(i) || 0, arrows);
     }
   }
+  ctx.fillStyle = "rgba(255,255,255,.75)";
+  ctx.fill(arrows);
   if (what.track && what.track.length > 1) {
     ctx.strokeStyle = ink.ink;
     ctx.lineWidth = 1.4 / look.scale;
