@@ -238,7 +238,7 @@ class Messages:
     length : int64
         Bytes of the message's data.
     read : callable
-        ``read(position, length)``: bytes at a position that counts like ``offset``.
+        ``read(position, length)``: bytes of one message, at a position that counts like ``offset``.
     """
 
     COLUMNS: ClassVar[tuple[str, ...]] = (

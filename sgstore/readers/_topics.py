@@ -518,11 +518,7 @@ def _hold(held: _Waiting, run: Messages, rows: NDArray[np.intp]) -> None:
 
 def _joined(run: Messages, rows: NDArray[np.intp]) -> bytes:
     """Return the data of the given messages as one sequence of bytes."""
-    if type(run) is not Messages or run.chunk_offset < 0:
+    if type(run) is not Messages:
         return b"".join(map(run.data, rows.tolist()))
     starts = run.offset[rows] + MESSAGE_HEAD.itemsize
-    first = int(starts.min())
-    ends = starts + run.length[rows] - first
-    chunk = run.read(first, int(ends.max()))  # one call for all messages
-    spans = zip((starts - first).tolist(), ends.tolist(), strict=True)
-    return b"".join([chunk[start:end] for start, end in spans])
+    return b"".join(map(run.read, starts.tolist(), run.length[rows].tolist()))

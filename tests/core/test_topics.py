@@ -340,3 +340,40 @@ def test_checksums_of_lists_are_those_of_their_texts(first: str, kind: str) -> N
     want = [text and int(hashlib.md5(text.encode()).hexdigest()[:15], 16) for (text,) in texts]
     assert [number for (number,) in rows] == want
     assert len(set(want)) == len({str(text) for text in texts}) > 6
+
+
+CARLA_TOPICS = (
+    "/carla/hero/vehicle_status",
+    "/carla/hero/odometry",
+    "/carla/vehicle_lights",
+    "/carla/traffic_lights/status",
+    "/tf",
+)
+
+
+def test_topics_that_an_ingest_stores_are_those_of_the_recording(
+    data: Path, tmp_path: Path
+) -> None:
+    """The ingest reads chunks of this recording from its cache of messages, which has parts of them."""
+    recording = data / "traces/carla/Town01.carla.mcap"
+    (stored,) = ingest(tmp_path / "stored.sgstore", [recording], topics=CARLA_TOPICS)
+    (read,) = ingest(tmp_path / "read.sgstore", [recording])
+    assert (stored.error, read.error) == (None, None)
+
+    for topic in CARLA_TOPICS:
+        rows = [
+            sgstore.open(tmp_path / f"{one}.sgstore")
+            .sql(f"SELECT * EXCLUDE (trace) FROM topic('{topic}') ORDER BY ALL")
+            .values
+            for one in ("stored", "read")
+        ]
+        with recording.open("rb") as file:
+            found = [message for _, _, message in make_reader(file).iter_messages(topics=[topic])]
+        assert len(rows[0]) == len(found) > 0
+        assert rows[0] == rows[1], topic
+        if topic == "/carla/vehicle_lights":
+            frames = sgstore.open(tmp_path / "stored.sgstore").sql(
+                f"SELECT frame FROM topic('{topic}')"
+            )
+            wanted = [json.loads(message.data)["frame"] for message in found]
+            assert sorted(frame for (frame,) in frames.values) == wanted
