@@ -158,7 +158,7 @@ def read_in_processes(
     paths: Sequence[Path],
     folder: Path,
 ) -> Generator[Views]:
-    """Yield the outcomes of the recordings, in order. The processes end with the generator.
+    """Read recordings in several processes, and yield their outcomes in order. Closing ends the processes.
 
     Parameters
     ----------
@@ -328,7 +328,7 @@ def _one_by_one(job: Job, paths: list[Path], folder: Path, meter: _Meter) -> Ite
 def _published(
     job: Job, file: StoreFile | None, views: Views
 ) -> tuple[StoreFile | None, list[TraceOutcome]]:
-    """Publish the segments of one recording. Return the store (created if needed) and the outcomes."""
+    """Add the segments of a recording to the store. Return the store (new if needed) and the outcomes."""
     outcomes = [outcome for outcome, _ in views]
     ready: dict[int, Sealed] = {}
     known: dict[int, str | None] = {}

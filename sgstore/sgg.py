@@ -164,7 +164,7 @@ class SceneGraphGenerator:
 
     @property
     def parked(self) -> Codes:
-        """State of each entity over all graphs so far, (n,) int8: 1 parked, 0 not parked, -1 unknown.
+        """Parking state of each entity after all graphs so far, (n,) int8: 1 parked, 0 not parked, -1 unknown.
 
         Examples
         --------
@@ -236,7 +236,7 @@ class SceneGraphGenerator:
         yield from self._driven.chosen(blocks)
 
     def block(self, frames: FrameBlock) -> GraphBlock:
-        """Return the scene graphs of the next frames for the ego of the frames.
+        """Return the scene graphs of the next frames. The ego is that of the frames.
 
         Raises
         ------
@@ -258,7 +258,7 @@ class SceneGraphGenerator:
         return self.blocks(frames, [frames.ego])[0]
 
     def blocks(self, frames: FrameBlock, egos: Sequence[Ints]) -> list[GraphBlock]:
-        """Return the scene graphs of the next frames for several egos, with shared work done once.
+        """Return the scene graphs of the next frames for several egos. Shared work is done once.
 
         Parameters
         ----------
@@ -291,7 +291,7 @@ class SceneGraphGenerator:
         return list(self.one_by_one(frames, egos))
 
     def one_by_one(self, frames: FrameBlock, egos: Sequence[Ints]) -> Iterator[GraphBlock]:
-        """Yield the same blocks as :meth:`blocks`, one at a time, to save memory.
+        """Yield the graphs of each ego for the next frames, as in :meth:`blocks`, but one ego at a time.
 
         Examples
         --------
@@ -357,7 +357,7 @@ class SceneGraphGenerator:
         return self._keeping.entities(kind) & ~self._left_out[node]
 
     def _beyond(self, frames: FrameBlock, poses: EgoPoses, outer: Extent, keys: Ints) -> _Beyond:
-        """Return the known entities around the graphs of one ego. ``keys`` are the rows inside the graphs."""
+        """Return the known entities near one ego but outside its graphs. ``keys``: rows inside the graphs."""
         if self._config.range.boundless:
             nowhere = np.full(len(frames), np.nan)
             poses = EgoPoses(nowhere, nowhere, nowhere, nowhere)
@@ -397,7 +397,7 @@ class SceneGraphGenerator:
 
     @staticmethod
     def _uneven(known: Bodies) -> int:
-        """Return the bits of ``UNEVEN`` for the bodies: flat bodies, different storeys, carried bodies."""
+        """Return a bit mask (see ``UNEVEN``): flat bodies, several storeys (bridges), carried bodies."""
         flat = ~IS_UPRIGHT[known.kind] & (known.height == 0)
         low, high = known.low_and_high
         near = known.moves | IS_USER[known.kind]
@@ -480,7 +480,7 @@ class SceneGraphGenerator:
     def _world_of(
         self, view: _View, whole: _World | None, ground: MapContext | None, edges: Edges
     ) -> WorldBlock | None:
-        """Return the surroundings of one ego's graphs: known entities near the ego, but outside the graphs."""
+        """Return the known entities near one ego but outside its graphs."""
         beyond = view.beyond
         if beyond is None or whole is None:
             return None
@@ -504,7 +504,7 @@ class SceneGraphGenerator:
     def _beyond_edges(
         self, bodies: Bodies, around: MapContext | None, edges: Edges
     ) -> tuple[Edges, LaneGaps]:
-        """Return the edges that change if entities outside the graphs are added, and the gaps of new edges."""
+        """Return edges that appear or disappear if entities outside the graphs count, and gaps of new edges."""
         if around is None:
             return Edges.chained([]), gaps(bodies, None)
         none = np.zeros(0, np.intp)
@@ -524,7 +524,7 @@ class SceneGraphGenerator:
 
     @classmethod
     def _of_the_past(cls, road_map: RoadMap | None, config: Config) -> SceneGraphGenerator:
-        """Return a generator that chooses driven lanes from earlier frames alone, as in online mode."""
+        """Return a generator that chooses driven lanes without later frames, as in online mode."""
         generator = cls(road_map, config)
         if generator._survey is not None:
             generator._survey.online = True
@@ -544,7 +544,7 @@ class SceneGraphGenerator:
     def _crowded(
         self, bodies: Bodies, over: Mapping[str, Bools]
     ) -> tuple[tuple[str, int, int], ...]:
-        """Return the frames with too many pairs and their number of objects, if a relation needs the pairs."""
+        """Return crowded frames whose pairs the settings need: kind of pairs, frame, number of objects."""
         found: list[tuple[str, int, int]] = []
         for what, frames in over.items():
             wanted = {"overlaps"} if what == TOUCHING else self._of_pairs
@@ -553,7 +553,7 @@ class SceneGraphGenerator:
         return tuple(found)
 
     def step(self, frame: Frame) -> SceneGraph:
-        """Return the scene graph of the next frame, for a client with its own loop.
+        """Return the scene graph of the next frame. For callers that pass frames one by one.
 
         The graph is the same as for a recording. For several egos, see :meth:`steps`.
 
@@ -568,7 +568,7 @@ class SceneGraphGenerator:
         return self.steps(frame)[0]
 
     def steps(self, frame: Frame, egos: Sequence[str] = ("",)) -> list[SceneGraph]:
-        """Return the scene graphs of the next frame for several egos, with shared work done once.
+        """Return the scene graphs of the next frame for several egos. Shared work is done once.
 
         Parameters
         ----------
@@ -615,7 +615,7 @@ class SceneGraphGenerator:
 
     @property
     def losses(self) -> list[Loss]:
-        """Losses of the steps so far: pairs in crowded frames, and implausible sizes and speeds.
+        """Data lost in all steps so far: pairs in crowded frames, and implausible sizes and speeds.
 
         Examples
         --------
@@ -630,7 +630,7 @@ class SceneGraphGenerator:
         return [*self._crowds.losses(self._config), *faults]
 
     def class_of(self, abstraction: str = "RSV", number: int = 0) -> str | None:
-        """Return the class of the last step's graph in an abstraction, the same as in a store.
+        """Return the class of the last step's graph in an abstraction. A store has the same class.
 
         Parameters
         ----------
@@ -697,7 +697,7 @@ class SceneGraphGenerator:
         return dict(zip(lanes.tolist(), roles, strict=True))
 
     def _seen(self, number: int) -> GraphColumns:
-        """Return a graph of the last step in the column form that abstractions need."""
+        """Return the graph of one ego in the last step, as the columns that abstractions use."""
         if self._online is None or self._online.last is None:
             raise ValueError("call step() first")
         graphs, kinds = self._online.last
@@ -765,7 +765,7 @@ class SceneGraphGenerator:
         return frame[held] * len(scenery) + row[held]
 
     def _held(self, frames: FrameBlock, areas: Areas) -> Bools:
-        """Return a mask of the states in range."""
+        """Return a mask of the object states that are in range, and that the settings do not exclude."""
         states = frames.states
         kind = self._kinds[states.node]
         held = areas.hold(frames.frame_of, _boxes(states), _bottom(states), hung=IS_SIGNAL[kind])
@@ -801,7 +801,7 @@ class SceneGraphGenerator:
 
 
 def map_of_graphs(road_map: RoadMap | None, config: Config) -> RoadMap | None:
-    """Return the map to store: the one with the nodes and static edges of the graphs."""
+    """Return the map that a store keeps: with the nodes and static edges that the graphs use."""
     waypoints = waypoints_of(road_map, config.lanes)
     road_map = road_map if waypoints is None else waypoints.road_map
     if road_map is None or config.lanes.sections:
@@ -811,7 +811,7 @@ def map_of_graphs(road_map: RoadMap | None, config: Config) -> RoadMap | None:
 
 @dataclass(frozen=True, slots=True)
 class _View:
-    """Part of the world in the range of one ego.
+    """Frames, object states and map parts in the range of one ego.
 
     Attributes
     ----------
@@ -838,7 +838,7 @@ class _View:
 
 @dataclass(frozen=True, slots=True)
 class _Beyond:
-    """Surroundings of one ego's graphs: known entities outside the graphs, but near the ego."""
+    """Known entities near one ego but outside its graphs."""
 
     frames: FrameBlock
     areas: Areas
@@ -847,7 +847,7 @@ class _Beyond:
 
 @dataclass(frozen=True, slots=True)
 class _World:
-    """Results for the range of all egos that do not depend on a single ego.
+    """Results in the range of all egos together: bodies, pairs and contacts. All egos share them.
 
     ``whole`` is the same with the surroundings of the graphs, but without pairs.
     """
@@ -862,7 +862,7 @@ class _World:
     uneven: int = 0
 
     def of(self, keys: Ints) -> _World:
-        """Return the results for the range of one ego."""
+        """Select from these results those in the range of one ego."""
         if len(keys) == len(self.keys):
             return self
         rows = np.searchsorted(self.keys, keys)
@@ -896,7 +896,7 @@ def _in_ascending(keys: Ints, some: Ints) -> Bools:
 
 
 def _reduced(frames: FrameBlock, kept: Rows) -> FrameBlock:
-    """Return the frames with only the given object states."""
+    """Return the frames with all object states removed except the given ones."""
     states = frames.states
     return replace(
         frames,
@@ -922,7 +922,7 @@ def _rows_apart(one: Edges, other: Edges) -> tuple[Rows, Rows]:
 
 
 def _keys(one: tuple[Whole | Codes, ...], other: tuple[Whole | Codes, ...]) -> tuple[Ints, Ints]:
-    """Return a number for each row of two tables. Equal rows have equal numbers."""
+    """Return a number for each row of two tables, so that equal rows have equal numbers."""
     keys = np.zeros(len(one[0]) + len(other[0]), np.int64)
     for columns in zip(one, other, strict=True):
         column = np.concatenate(columns, dtype=np.int64)
@@ -932,7 +932,7 @@ def _keys(one: tuple[Whole | Codes, ...], other: tuple[Whole | Codes, ...]) -> t
 
 
 def _among(place: Rows, pairs: tuple[Rows, Rows]) -> tuple[Rows, Rows]:
-    """Convert pairs to new row numbers. Drop the pairs with a removed row."""
+    """Convert pairs of old row numbers to new ones. Drop each pair in which a row was removed."""
     a, b = place[pairs[0]], place[pairs[1]]
     both = (a >= 0) & (b >= 0)
     return a[both], b[both]
