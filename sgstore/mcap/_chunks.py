@@ -56,12 +56,12 @@ class Recording(Protocol):
 
     @property
     def schemas(self) -> Mapping[int, Schema]:
-        """Message schemas of the recording, by schema id."""
+        """Message schemas of the recording: schema id → schema."""
         ...
 
     @property
     def channels(self) -> Mapping[int, Channel]:
-        """Channels of the recording, by channel id."""
+        """Channels of the recording: channel id → channel."""
         ...
 
     @property
@@ -98,7 +98,7 @@ class Recording(Protocol):
         ...
 
     def settle_order(self, rank: Callable[[int], int]) -> None:
-        """Check the time order of all messages once. If it is wrong, later calls of ``walk`` sort them."""
+        """Check once that all messages are sorted by time. If not, later calls of ``walk`` sort them."""
         ...
 
     def close(self) -> None:
@@ -214,7 +214,7 @@ class StrictStream(ReadDataStream):
         super().__init__(BytesIO(record))
 
     def read(self, length: int) -> bytes:
-        """Return exactly ``length`` bytes. Fewer available bytes are an error."""
+        """Return exactly ``length`` bytes. Raise an error if fewer are available."""
         data = super().read(length)
         if len(data) != length:
             raise EndOfFile
@@ -223,7 +223,7 @@ class StrictStream(ReadDataStream):
 
 @dataclass(frozen=True, slots=True)
 class Messages:
-    """Group of consecutive messages of an MCAP file, as columns: those of one chunk, or outside chunks.
+    """Consecutive messages of an MCAP file as columns, either of one chunk or outside chunks.
 
     Attributes
     ----------
@@ -277,12 +277,12 @@ class Messages:
         return self.read(int(self.offset[row]) + MESSAGE_HEAD.itemsize, int(self.length[row]))
 
     def stacked(self) -> Ints:
-        """Return the columns of :attr:`COLUMNS` as rows of one array."""
+        """Return the columns named in :attr:`COLUMNS`, as the rows of one array."""
         return np.stack([getattr(self, name).view(np.int64) for name in Messages.COLUMNS])
 
     @staticmethod
     def unstacked(columns: Ints) -> dict[str, Any]:
-        """Return the columns of messages in an array of :meth:`stacked`, by name."""
+        """Convert an array of :meth:`stacked` back to the columns of messages, by name."""
         named: dict[str, Any] = dict(zip(Messages.COLUMNS, columns, strict=True))
         return named | {"publish_time_ns": named["publish_time_ns"].view(np.uint64)}
 
@@ -609,7 +609,7 @@ def message_columns(
 
 
 def _frame_records(records: Records) -> tuple[Ints, list[tuple[int, int, int]], int]:
-    """Return the offsets of messages in a chunk, the spans of definitions, and the last complete end."""
+    """Return the offsets of messages in a chunk, the spans of definitions, and the end of the last record."""
     offsets = array("q")
     definitions: list[tuple[int, int, int]] = []
     position, total, head_at = 0, len(records), HEAD.unpack_from

@@ -73,7 +73,7 @@ class BagPart:
 
 
 def bag_folder(path: Path) -> Path | None:
-    """Return the folder of a bag from its path or its ``metadata.yaml``, or ``None`` if it is not a bag.
+    """Return the folder of a bag from its path or its ``metadata.yaml``; ``None`` if it is not a bag.
 
     A folder is a bag if its ``metadata.yaml`` begins like those of rosbag2, because other tools write such
     files, too.
@@ -105,7 +105,7 @@ FOLDERS: Final = {
 
 
 def log_files(path: Path) -> list[Path] | None:
-    """Return the files of a recording in a folder of another format. ``None`` for any other path."""
+    """Return the files of a recording that is a folder, but not MCAP; ``None`` for any other path."""
     if url_named(path) is not None:
         return None
     if (stored := _sqlite_bag(path)) is not None:
@@ -173,7 +173,7 @@ def parts_of(folder: Path) -> tuple[BagPart, ...]:
 
 
 def part_at(parts: tuple[BagPart, ...], place: int) -> BagPart | None:
-    """Return the file of a bag that contains a byte position of the bag, or ``None``."""
+    """Return the file of a bag that contains a byte position of the bag; ``None`` if no file does."""
     there = (part for part in parts if part.base <= place < part.base + part.size)
     return next(there, None)
 
@@ -362,7 +362,7 @@ def digest_of(path: Path) -> str:
 
 
 def read_and_digest(path: Path, digest: str, read: Callable[[], _Found]) -> tuple[_Found, str]:
-    """Read a recording and hash its file at the same time, so that the disk is read once.
+    """Read a recording and compute the hash of its file at the same time. The disk is read only once.
 
     Parameters
     ----------
@@ -447,7 +447,7 @@ def mark_of_open(file: BufferedReader) -> tuple[int, int]:
 
 @contextmanager
 def near(path: Path, folder: Path) -> Generator[None]:
-    """Context manager in which a remote recording is read from a local copy.
+    """Context manager: copy a remote recording to a local folder, and read the copy inside the block.
 
     Other code still uses the URL of the recording.
 

@@ -11,7 +11,7 @@ MAX_LOSSES: Final = 1000
 
 @dataclass(frozen=True, slots=True)
 class Loss:
-    """Unreadable part of a recording: reason, number of messages, bytes and time span.
+    """Unreadable part of a recording: reason, number of lost messages and bytes, and time span.
 
     Attributes
     ----------

@@ -66,12 +66,12 @@ _SIZES: Final = np.floor(2 ** (np.arange(256) / 8)).astype(np.int64)
 
 
 class OutOfOrder(Exception):  # noqa: N818  (a signal, not an error)
-    """Signal: the messages are not in order of time. The next pass must sort them."""
+    """Signal for internal use: the messages are not sorted by time. The next reading must sort them."""
 
 
 @dataclass(frozen=True, slots=True)
 class SortedMessages(Messages):
-    """Group of messages sorted by time, which can come from several chunks of a file.
+    """Messages sorted by time. They can come from several chunks of a file.
 
     Attributes
     ----------
@@ -108,7 +108,7 @@ class SortedMessages(Messages):
 
 @dataclass(slots=True)
 class ChannelRanks:
-    """Reading order of channels for messages with equal times.
+    """Order in which to read channels, for messages with equal times.
 
     Attributes
     ----------
@@ -127,12 +127,12 @@ class ChannelRanks:
     _loose: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(IDS, np.bool_))
 
     def of(self, channel: NDArray[Any]) -> Ints:
-        """Return the position of each channel in the reading order for equal times."""
+        """Return the place of each channel in the order of reading, (N,), for messages with equal times."""
         self._learn()
         return self._numbers[channel]
 
     def is_loose(self, channel: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return a mask of the channels whose order does not matter for messages with equal times."""
+        """Return a mask of the channels that may come in any order among messages with equal times."""
         self._learn()
         return self._loose[channel]
 
@@ -152,7 +152,7 @@ class ChannelRanks:
 
 
 def published(log_time: Ints, publish_time: Times, channel: NDArray[Any]) -> Times:
-    """Return publish times that do not decrease within a channel. Earlier ones are raised."""
+    """Return publish times that never decrease for messages of one channel with equal log time."""
     order = np.lexsort((channel, log_time))  # stable: equal messages keep their place
     log, number, times = log_time[order], channel[order], publish_time[order]
     same = (log[1:] == log[:-1]) & (number[1:] == number[:-1])
@@ -203,7 +203,7 @@ class OrderCheck:
         return True
 
     def _is_in_order(self, log: Ints, publish: Times, channel: Ints) -> bool:
-        """Return True if consecutive messages with equal log time are in the right order."""
+        """Return True if consecutive messages with equal log time are sorted by publish time and channel."""
         bound = ~self._ranks.is_loose(channel)
         log, publish, number = log[bound], publish[bound], self._ranks.of(channel[bound])
         before = publish[1:] < publish[:-1]
@@ -241,7 +241,7 @@ class _IndexBlock:
         return part
 
     def numbers(self) -> Numbers:
-        """Return the number of each message, counted from the start of the file."""
+        """Return the index of each message in the whole file, from 0."""
         return (self.first + self.entries["row"].astype(np.int64)).astype(np.uint32)
 
 
@@ -312,7 +312,7 @@ class TimeOrder:
             yield _block_of(waiting, first)
 
     def _note(self, run: Messages, keeps: Callable[[int], bool]) -> None:
-        """Record the position and channels of a group of messages, and by how much its log times decrease."""
+        """Record position and channels of a group of messages, and the largest step back in log time."""
         for number in np.unique(run.channel).tolist():
             self._kept[number] = keeps(number)
             times = run.log_time_ns[run.channel == number]
@@ -423,7 +423,7 @@ class TimeOrder:
 
 
 def _no_place(_position: int, _length: int) -> memoryview:
-    """Raise an error, because messages of several chunks have no common byte positions."""
+    """Raise an error: messages of several chunks cannot be read by one byte position."""
     raise NotImplementedError
 
 
@@ -443,7 +443,7 @@ def _block_of(entries: bytearray, first: int) -> _IndexBlock:
 
 
 def _in_order(blocks: Sequence[_IndexBlock], keys: Sequence[str], most: int) -> Iterator[Numbers]:
-    """Yield the message numbers of a file in order of time, part by part. The given index is emptied.
+    """Yield the indices of all messages in order of time, part by part. The given index is emptied.
 
     Parameters
     ----------
@@ -474,7 +474,7 @@ def _in_order(blocks: Sequence[_IndexBlock], keys: Sequence[str], most: int) -> 
 
 
 def _edges(blocks: Sequence[_IndexBlock], key: str, most: int) -> list[Edge]:
-    """Return values of the key (such as times) that divide an index into parts that are small enough to sort.
+    """Return key values, such as times, at which to split an index into parts small enough to sort.
 
     A value with many messages becomes a separate part. The last part begins at the greatest value.
     """
@@ -492,7 +492,7 @@ def _edges(blocks: Sequence[_IndexBlock], key: str, most: int) -> list[Edge]:
 
 
 def _raise_publish_times(blocks: Sequence[_IndexBlock]) -> None:
-    """Raise publish times in an index that are earlier than that of the previous message of the channel."""
+    """In a sort index, replace publish times that decrease within a channel by its latest time."""
     latest = np.zeros(IDS, np.uint64)
     for block in blocks:
         channel = block.entries["channel"]
@@ -502,7 +502,7 @@ def _raise_publish_times(blocks: Sequence[_IndexBlock]) -> None:
 
 
 def _sorted(blocks: Sequence[_IndexBlock]) -> Numbers:
-    """Return the message numbers of some parts of a sort index, in order of time."""
+    """Return the indices of the messages in some parts of a sort index, in order of time."""
     entries = np.concatenate([block.entries for block in blocks])
     log, channel = entries["log"], entries["channel"]
     order = np.lexsort((channel, published(log, entries["publish"], channel), log))

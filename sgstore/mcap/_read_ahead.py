@@ -1,4 +1,4 @@
-"""Reading of MCAP chunks in advance: file summary, memory buffers, and decompression in threads.
+"""Read MCAP chunks in advance: file summary, reused memory buffers, and decompression in threads.
 
 Buffers are reused after their last view is gone. Fresh memory for every chunk would be slower: the system must
 map and clear each page, and recently used memory is in the processor cache.
@@ -90,7 +90,7 @@ class Buffers:
 
 
 def _is_free(buffer: bytearray) -> bool:
-    """Return True if no view of a memory buffer exists, so that its size can change."""
+    """Return True if no view of a memory buffer exists. Only then can its size change."""
     try:
         buffer.append(buffer.pop())
     except BufferError:
@@ -205,7 +205,7 @@ _COLUMNS: Final = 7
 
 
 class Spool:
-    """Cache on disk for the messages of MCAP chunks, by file and chunk offset."""
+    """Cache on disk for the messages of MCAP chunks. The key is the file and the chunk's offset."""
 
     def __init__(self) -> None:
         self._file: SpooledTemporaryFile[bytes] | None = None
@@ -214,7 +214,7 @@ class Spool:
         self._most = MOST_SPOOLED
 
     def put(self, path: Path, messages: Messages, kept: NDArray[np.bool_]) -> None:
-        """Add a chunk to the cache: the positions of all messages, and the bytes of some.
+        """Add the messages of a chunk to the cache: the positions of all of them, and the data of some.
 
         A chunk that is already cached is skipped, as is any chunk when the cache is full.
         """
@@ -243,7 +243,7 @@ class Spool:
         return (path, chunk_offset) in self._places
 
     def get(self, path: Path, chunk_offset: int, anew: Callable[[], Read]) -> Messages | None:
-        """Return the messages of a chunk from the cache. ``None`` if not cached, or not readable again.
+        """Return the messages of a chunk from the cache; ``None`` if they are not there, or unreadable.
 
         Parameters
         ----------
@@ -280,7 +280,7 @@ class Spool:
 
 
 def _reader(starts: dict[int, int], data: memoryview, anew: Callable[[], Read]) -> Read:
-    """Return a function that reads the bytes of a cached message by position.
+    """Return a function that reads the data of a cached message at a byte position.
 
     ``starts`` maps record offsets to offsets in ``data``.
     """
@@ -324,7 +324,7 @@ Found = dict[int, "tuple[ChunkHead, Records | TraceError]"]
 
 
 def chunks_in(file: BufferedReader) -> Iterator[int]:
-    """Yield the byte offsets of the chunks of an MCAP file that has no usable summary section.
+    """Yield the byte offset of each chunk of an MCAP file without a usable summary section.
 
     The search stops after more than :data:`BETWEEN` other records in a row.
     """
@@ -342,7 +342,7 @@ def chunks_in(file: BufferedReader) -> Iterator[int]:
 
 
 class ReadAhead:
-    """Reader of MCAP chunks that decompresses the next chunks in other threads.
+    """Reader of MCAP chunks. While one chunk is used, other threads decompress the next ones.
 
     Parameters
     ----------
@@ -400,7 +400,7 @@ class ReadAhead:
         self._buffers.clear()
 
     def _begin(self) -> None:
-        """Start the decompression of the next chunks in other threads, up to a limit."""
+        """Start to decompress the next chunks in other threads, up to a size limit."""
         while self._size + BATCH <= AHEAD and (chunks := self._batch()):
             if self._threads is None:
                 self._threads = ThreadPoolExecutor(THREADS, "sgstore-chunks")
@@ -415,7 +415,7 @@ class ReadAhead:
             self._size += size
 
     def _batch(self) -> list[_Chunk]:
-        """Return the next chunks of the file, still compressed."""
+        """Return the next chunks of the file that are worth a thread, still compressed."""
         chunks: list[_Chunk] = []
         size = 0
         try:
@@ -441,7 +441,7 @@ class ReadAhead:
 
 
 class _Chunk(NamedTuple):
-    """Compressed chunk of a file, with memory for the decompressed bytes."""
+    """Compressed chunk of a file, and the memory into which it is decompressed."""
 
     head: ChunkHead
     stored: Records

@@ -214,7 +214,7 @@ class McapFile:
             self._spool.close()
 
     def reopen(self) -> None:
-        """Open the MCAP file again after it was closed.
+        """Open the MCAP file again, after it was closed.
 
         Raises
         ------
@@ -226,7 +226,7 @@ class McapFile:
 
     @property
     def window(self) -> tuple[int, int]:
-        """First and last log time of a clip, both included; ns. For other files: the full range.
+        """First and last log time of a clip, both included; ns. Other files have no limits.
 
         A clip also contains earlier or later messages that its own messages depend on.
         """
@@ -286,7 +286,7 @@ class McapFile:
         yield from self._order.walk(report, wanted)
 
     def settle_order(self, rank: Callable[[int], int]) -> None:
-        """Check the time order of all messages once. If it is wrong, later calls of ``walk`` sort them."""
+        """Check once that all messages are sorted by time. If not, later calls of ``walk`` sort them."""
         if not self._in_order and not self._unordered:
             with suppress(OutOfOrder):
                 for _ in self.walk(Findings(), rank=rank):
@@ -368,7 +368,7 @@ class McapFile:
         return header.profile, header.library
 
     def _read_ahead(self, wanted: Callable[[int], bool] | None) -> ReadAhead:
-        """Start decompression in other threads for a reading of all chunks of a large file."""
+        """If all chunks of a large file will be read, start to decompress them in other threads."""
         if wanted is not None or self.size <= SMALL:
             return ReadAhead(self._file, verified=self._verified)
         offsets = self._chunk_starts or chunks_in(self._file)
@@ -376,13 +376,13 @@ class McapFile:
         return ReadAhead(self._file, offsets, self._verified)
 
     def _head(self, position: int) -> tuple[int, int] | None:
-        """Return type and length of the record at a byte position. ``None`` means truncated."""
+        """Return the type and length of the record at a byte position; ``None`` if the record is truncated."""
         self._file.seek(position)
         head = self._file.read(HEAD.size)
         return HEAD.unpack(head) if len(head) == HEAD.size else None
 
     def _passes(self, walk: _FileWalk, length: int) -> bool:
-        """Skip a record without useful content. Return False if its length is impossible."""
+        """Skip a record without useful content. Return False if its length may be wrong."""
         stop = walk.position + HEAD.size + length
         sound = walk.pending is None and stop <= self.size
         sound = sound and self._chunk_behind(walk.position, stop) is None
@@ -425,7 +425,7 @@ class McapFile:
             yield from self._flush(walk)
 
     def _flush(self, walk: _FileWalk) -> Iterator[Messages]:
-        """Yield the messages outside chunks that were collected so far."""
+        """Yield the messages outside chunks that were found since the last call."""
         if not walk.run:
             return
         offsets = np.frombuffer(walk.run, np.int64)
@@ -516,7 +516,7 @@ class McapFile:
             yield messages
 
     def _chunk_behind(self, start: int, stop: int) -> int | None:
-        """Return the offset of the first chunk between two offsets according to the summary, or ``None``.
+        """Return the offset of the first chunk between two offsets, from the summary; ``None`` without one.
 
         An offset of the summary counts only if a valid chunk head is at this place.
         """
@@ -529,7 +529,7 @@ class McapFile:
         return None
 
     def _broken(self, walk: _FileWalk, opcode: int, length: int) -> Iterator[Messages]:
-        """Handle a record with an impossible length: continue at the next chunk in the summary, or stop."""
+        """Handle a record with an impossible length: continue with the next chunk in the summary, or stop."""
         resume = self._chunk_behind(walk.position, self.size)
         start = walk.position
         stop = self.size if resume is None else resume
@@ -565,7 +565,7 @@ class McapFile:
     def _of_cut(
         self, start: int
     ) -> tuple[ChunkHead | None, Messages | None, list[tuple[int, memoryview]]]:
-        """Return header, complete messages and definitions of a truncated chunk."""
+        """Return header, complete messages and definitions (schemas, channels) of a truncated chunk."""
         found = head_of_cut_chunk(bytes(self._at(start, min(self.size - start, MAX_CHUNK))), start)
         if found is None:
             return None, None, []
@@ -577,20 +577,20 @@ class McapFile:
             return head, None, []
 
     def _count(self, walk: _FileWalk, length: int) -> None:
-        """Add the messages that an index record lists to the count of a lost chunk."""
+        """Count the entries of an index record as lost messages of a chunk that was lost."""
         if walk.pending is None:
             return
         entries = max(length - 6, 0) // 16
         walk.pending = replace(walk.pending, messages=max(walk.pending.messages, 0) + entries)
 
     def _settle(self, walk: _FileWalk) -> None:
-        """Report a lost chunk, after the index records with its message counts are read."""
+        """Report a lost chunk. Call it after its index records, which contain the number of messages."""
         if walk.pending is not None:
             walk.report.lose(walk.pending)
             walk.pending = None
 
     def _closing_words(self, walk: _FileWalk) -> None:
-        """Add warnings about unusual properties of the whole file that lose no data."""
+        """Add warnings about unusual properties of the whole file. No data are lost because of them."""
         warn = walk.report.warnings.append
         left = self.size - walk.position
         if not walk.closed:
@@ -638,7 +638,7 @@ class McapFile:
             walk.report.warnings.append(odd)
 
     def _take_up(self, opcode: int, content: memoryview, place: RecordPlace | None = None) -> str:
-        """Add a schema or channel to the file object. Return a warning; empty if the record is valid."""
+        """Add a schema, channel or metadata record to the file object. Return a warning, or an empty text."""
         stream = StrictStream(content)
         if opcode == Opcode.METADATA and place is not None:
             if place not in self.metadata:
@@ -759,7 +759,7 @@ class McapBag(McapFile):
 
     @property
     def compression(self) -> str:
-        """Name of the compression of the first chunk. Before the first chunk is read, it is ``zstd``."""
+        """Compression name of the bag's first chunk, such as ``lz4``; ``zstd`` before a chunk was read."""
         return next(iter(self._files.values())).compression
 
     def _in_file_order(
@@ -874,11 +874,11 @@ class McapBag(McapFile):
         return free
 
     def _meant(self, keep: Callable[[int], bool], file: McapFile) -> Callable[[int], bool]:
-        """Convert a filter by channel ids of the bag to a filter by channel ids of one file."""
+        """Convert a filter of channel ids in the bag to a filter of channel ids in one of its files."""
         return lambda number: keep(self._own[file.path, number])
 
     def _placed(self, file: McapFile, run: Messages, base: int) -> Messages:
-        """Return the messages of a file with the channel ids and byte positions of the whole bag."""
+        """Return messages of one file with the channel ids and byte positions of the whole bag."""
         ids, index = np.unique(run.channel, return_inverse=True)
         own = np.array([self._own[file.path, number] for number in ids.tolist()], np.int64)
         if run.chunk_offset >= 0:
@@ -895,7 +895,7 @@ def _all(_channel: int) -> bool:
 
 
 def _key_of(channel: Channel, file: McapFile) -> tuple[Any, ...]:
-    """Return a key of a channel. Channels of two files with equal keys are one channel of the bag."""
+    """Return the key of a channel. Channels of two files with equal keys become one channel in the bag."""
     schema = file.schemas.get(channel.schema_id)
     definition = (schema.name, schema.encoding, schema.data) if schema else ()
     return channel.topic, channel.message_encoding, *definition

@@ -58,7 +58,7 @@ def object_stores() -> Any:
 
 
 def object_store_at(url: str) -> Any:
-    """Open the object store at a URL, with retries after temporary errors."""
+    """Open the object store at a URL. Requests are repeated after temporary errors."""
     return object_stores().store.from_url(url, **_options(url))
 
 
@@ -75,7 +75,7 @@ def _options(url: str) -> dict[str, Any]:
 
 
 def reason_of_object_store(error: BaseException) -> tuple[str, bool]:
-    """Return a one-line reason for an object store error. The second value is True for a missing object."""
+    """Return the reason for an object store error as one line, and True if the object does not exist."""
     wrong = object_stores().exceptions
     if isinstance(error, FileNotFoundError | wrong.NotFoundError):
         return "object or bucket not found", True
@@ -87,7 +87,7 @@ def reason_of_object_store(error: BaseException) -> tuple[str, bool]:
 
 
 def fetch_object(store: Any, name: str, file: IO[bytes]) -> None:
-    """Download an object into an open file, and try again after an early end.
+    """Download an object into an open file. Try again if the data end too early.
 
     Raises
     ------
@@ -340,7 +340,7 @@ def whole(url: str, size: int, ask: Callable[[], memoryview]) -> memoryview:
 
 @contextmanager
 def copied(urls: list[str], folder: Path) -> Generator[None]:
-    """Context manager in which remote files are read from local copies in a folder.
+    """Context manager: copy remote files to a local folder, and read the copies inside the block.
 
     Raises
     ------
