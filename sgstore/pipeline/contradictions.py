@@ -93,7 +93,7 @@ _VEHICLE: Final = np.array([KIND_CODE[kind] for kind in kinds_labelled("Vehicle"
 
 
 class Contradiction(NamedTuple):
-    """Result about one kind of contradiction: first body and frame, all bodies, number of rows, and a text."""
+    """Finding about one kind of contradiction: first body and frame, all bodies, row count, description."""
 
     kind: str
     node: int
@@ -105,7 +105,7 @@ class Contradiction(NamedTuple):
 
 @dataclass(slots=True)
 class Vote:
-    """Contradicting rows of one body: number of rows, first frame, its two values, and votes for causes."""
+    """Contradicting rows of one body: row count, first frame, its two values, and votes for causes."""
 
     frame: int
     values: tuple[float, float]
@@ -115,7 +115,7 @@ class Vote:
 
 @dataclass(frozen=True, slots=True)
 class BodyRows:
-    """States of bodies, sorted by node and frame: those of a block, and the last ones of earlier blocks.
+    """States of bodies, sorted by node and frame: those of a block, after the last ones of earlier blocks.
 
     Attributes
     ----------
@@ -164,7 +164,7 @@ class Steps:
 
     @classmethod
     def of(cls, block: FrameBlock, before: BodyRows | None) -> Steps:
-        """Return the steps that end in a block, also from the last three rows of each recent body."""
+        """Return the steps (pairs of successive states) that end in a block. Some begin before it."""
         states, frame_of = block.states, block.frame_of
         node, frame, time_ns = states.node, block.seq[frame_of], block.time_ns[frame_of]
         values = np.column_stack([getattr(states, name) for name in COLUMNS])
@@ -203,13 +203,13 @@ class Steps:
 
 @dataclass(slots=True)
 class Tally:
-    """Votes about contradictions and numbers of compared steps, for each quantity and body."""
+    """Votes for the causes of contradictions, and numbers of compared steps, by quantity and body."""
 
     votes: dict[tuple[str, int], Vote] = field(default_factory=dict[tuple[str, int], Vote])
     compared: dict[str, Ints] = field(default_factory=dict[str, "Ints"])
 
     def total(self, quantity: str, node: int | None = None) -> int:
-        """Return the number of compared steps of a body, or of all bodies."""
+        """Return how many steps of a body (or of all bodies) were compared."""
         counts = self.compared.get(quantity, np.zeros(0, np.int64))
         return int((counts if node is None else counts[node : node + 1]).sum())
 
@@ -222,7 +222,7 @@ class Tally:
         values: tuple[Floats, Floats],
         *causes: Floats,
     ) -> None:
-        """Count the compared and the contradicting steps. Each of the latter votes for its causes.
+        """Count compared steps and contradicting steps. Each contradicting step votes for its possible causes.
 
         ``values`` has a row per step, and a cause per contradicting step.
         """
@@ -250,12 +250,12 @@ class Tally:
 
 
 def factor_of(cause: float) -> float:
-    """Return the factor that a bin of votes represents."""
+    """Convert the number of a histogram bin of votes to the factor that it represents."""
     return float(np.exp(cause / _BINS))
 
 
 def add_contradictions(steps: Steps, kinds: Ints, tally: Tally) -> None:
-    """Compare the recorded values of each step with the movement, and add the contradictions to a tally.
+    """Compare recorded velocity, heading, acceleration and yaw rate with the movement. Count contradictions.
 
     Parameters
     ----------
@@ -378,7 +378,7 @@ def _rates(
 
 
 def judged(tally: Tally) -> Iterator[Contradiction]:
-    """Yield the contradictions on which enough rows agree: by body, otherwise over all bodies."""
+    """Yield the contradictions with enough agreeing votes, for single bodies or for all together."""
     quantities: dict[str, dict[int, Vote]] = {}
     for (quantity, node), vote in tally.votes.items():
         quantities.setdefault(quantity, {})[node] = vote
@@ -401,7 +401,7 @@ def judged(tally: Tally) -> Iterator[Contradiction]:
 def _agreed(
     quantity: str, votes: dict[int, Vote], tally: Tally
 ) -> list[tuple[int, Vote, tuple[str, str]]]:
-    """Return the bodies with a contradiction. If no single body has one, return the sum of all votes."""
+    """Return the bodies with a contradiction. If no body has one, judge the votes of all bodies together."""
     told = [
         (node, vote, _verdict(quantity, vote, tally.total(quantity, node)))
         for node, vote in votes.items()
@@ -426,7 +426,7 @@ def _agreed(
 
 
 def _alike(cause: int) -> tuple[int, ...]:
-    """Return a bin of a factor or an angle, with its two neighbours."""
+    """Return the bin (histogram cell) of a factor or an angle, and its two neighbours."""
     base = (cause + 500) // 1_000 * 1_000
     if not base:
         return cause - 1, cause, cause + 1
@@ -499,7 +499,7 @@ def _of_yaw_rate(cause: int, recorded: float, actual: float) -> tuple[str, str] 
 
 
 def _near(factor: float, names: dict[float, str]) -> str:
-    """Return the name of the factor that is at most 12 % away, or an empty text."""
+    """Return the name of a known factor within 12 % of the given one; otherwise an empty text."""
     near = min(names, key=lambda one: abs(np.log(one / factor)))
     return names[near] if abs(np.log(near / factor)) < 0.12 else ""
 

@@ -123,7 +123,7 @@ def derive(
 def keep_abstraction(
     store: str | Path, name: str, traces: Sequence[int | str] = ()
 ) -> list[Derivation]:
-    """Store the labelled graphs of an abstraction as a named set, so that queries can use them.
+    """Store an abstraction's graph of each frame as a named set of relations, for use in queries.
 
     This works for ``roadscene2vec`` and for a client's own function. The set contains nodes of the scene graph,
     and edges labelled with relations. Artificial nodes and other labels are only in ``graph(frame,
@@ -213,7 +213,7 @@ def _digest(config: Config) -> str:
 
 
 def _settings(trace: StoredTrace, wanted: Config) -> Config:
-    """Return the settings for deriving relations of a trace. Stored states that do not suffice are an error.
+    """Return the settings for deriving a trace's relations. Raise an error if stored states do not suffice.
 
     Raises
     ------
@@ -273,7 +273,7 @@ def _shown(settings: RangeSettings) -> dict[str, Any]:
 
 
 def _covers(old: RangeSettings, new: RangeSettings) -> bool:
-    """True if the old area around the ego surely contains the new area, heights included."""
+    """True if the old area around the ego surely contains the new one, in the plane and in height."""
     if _shown(old) == _shown(new):
         return True
     for name in ("by", "static_by"):
@@ -286,7 +286,7 @@ def _covers(old: RangeSettings, new: RangeSettings) -> bool:
 
 
 def _reaches(old: RangeSettings, new: RangeSettings) -> bool:
-    """True if the old area around the ego contains the new area. Heights are ignored."""
+    """True if the old area around the ego contains the new one. Heights are not compared."""
     if old.shape == new.shape == "corridor":
         return new.length <= old.length and new.width <= old.width
     if old.shape == "polygon":

@@ -188,7 +188,7 @@ class Finding:
 
 @dataclass(slots=True)
 class _Event:
-    """Occurrences of one kind of implausible data: the first one, the entities, and the number."""
+    """All cases of one kind of implausible data: the first case, the entities, and the number of cases."""
 
     node: int
     frame: int
@@ -384,7 +384,7 @@ class Plausibility:
         event.nodes.add(node)
 
     def _happen_each(self, kind: str, block: FrameBlock, rows: Bools, value: str) -> None:
-        """Record an occurrence for each row in a mask. ``value`` is a text with columns in braces."""
+        """Count cases of implausible data: one for each row in a mask. ``value``: text with ``{column}``."""
         at = np.flatnonzero(rows)
         states, first = block.states, int(at[0])
         shown = {name: float(getattr(states, name)[first]) for name in _SHOWN}
@@ -397,7 +397,7 @@ class Plausibility:
     # Numbers that contradict the movement.
 
     def _lost(self, losses: Sequence[Loss]) -> Iterator[Finding]:
-        """Yield findings for losses: values that readers removed because they are impossible."""
+        """Yield a finding for each kind of impossible value that a reader removed."""
         kinds: dict[str, list[tuple[str, str, int, int]]] = {}
         for loss in losses:
             if (told := _FAULT.fullmatch(loss.reason)) is not None:
@@ -436,7 +436,7 @@ class Plausibility:
             self._moves.append(_Move(node, frame, complex(*start), complex(*end)))
 
     def _see_returned(self, rows: BodyRows, before: int) -> None:
-        """Find bodies whose id belonged to another body immediately before."""
+        """Find new bodies whose id another body used until the frame before."""
         if not self._nodes:
             self._nodes = {ident: node for node, ident in enumerate(self._idents[:before])}
         for node in range(before, len(self._idents)):
@@ -455,7 +455,7 @@ class Plausibility:
                 self._happen("reused id", node, frame, "it returns as another body")
 
     def _see_absences(self, steps: Steps) -> None:
-        """Find bodies that are absent and then return farther away than they can have moved."""
+        """Find bodies that disappear and come back farther away than they could have moved."""
         values, at, seconds = steps.rows.values, steps.at, steps.seconds
         speeds = [np.hypot(*np.nan_to_num(values[row, VX : VX + 2]).T) for row in (at, at + 1)]
         reach = (speeds[0] + speeds[1]) / 2 * seconds + BRAKING / 4 * seconds**2 + STRIDE
@@ -490,7 +490,7 @@ class Plausibility:
                 self._grown.setdefault(node, (frame, value))
 
     def _judge_moves(self) -> None:
-        """Record jumps as occurrences. Two bodies that exchange places in one frame have exchanged ids."""
+        """Count jumps of bodies as implausible. Two bodies that swap places in a frame have swapped ids."""
         frames: dict[int, list[_Move]] = {}
         step = _USUAL * float(np.median(np.diff(self._times))) / 1e9 if self._moves else 0.0
         for move in self._moves:
@@ -566,7 +566,7 @@ class Plausibility:
         self._shares["vehicles"] += int(vehicle.sum())
 
     def _judge(self) -> None:
-        """Drop kinds of occurrences that are too rare, and add those of sizes and heights."""
+        """Remove kinds of implausible data with too few cases. Add changing sizes and impossible heights."""
         events, shares = self._events, self._shares
         rare = {
             kind
@@ -637,7 +637,7 @@ class Plausibility:
             )
 
     def _judge_places(self, road_map: RoadMap) -> None:
-        """Compare the sampled positions of the ego (without one, of all vehicles) with the lanes."""
+        """Compare a sample of ego positions with the lanes. Without an ego, use those of all vehicles."""
         places = np.concatenate(self._places)
         places = places[places[:, 3] > 0]
         own = places[places[:, 2] > 0] if places[:, 2].any() else places
@@ -682,7 +682,7 @@ class Plausibility:
     # Traffic lights.
 
     def _see_lights(self, rows: BodyRows) -> None:
-        """Compare the states of lights with their earlier states, and their references with the map."""
+        """Check the lights: possible order of states, flicker. Store which lights need lanes in the map."""
         shown = rows.values[:, LIGHT].astype(np.int64)
         lit = rows.fresh & (shown >= 0)
         # A light that is always off needs no lanes.

@@ -65,7 +65,7 @@ class Rebuilt:
 
 @dataclass(frozen=True, slots=True)
 class _ReadingStep:
-    """Traces of a rebuild that are read together, because they have equal settings, time range and map."""
+    """Traces that a rebuild ingests in one pass: their settings, time range and map are equal."""
 
     config: Config
     part: tuple[float | None, float | None]
@@ -147,7 +147,7 @@ def rebuild(
 
 
 def _without(path: Path, whole: Remains, leave_out: Sequence[str]) -> Remains:
-    """Return the description of an old store without the traces to leave out."""
+    """Return the description of an old store, reduced to the traces to rebuild."""
     names = [one.name for one in whole.traces]
     strange = [name for name in leave_out if name not in names]
     if strange:
@@ -186,7 +186,7 @@ def _alone(fresh: Path) -> Generator[None]:
 def _found(
     path: Path, traces: Sequence[OldTrace], look_in: Sequence[str | Path]
 ) -> dict[int, Path]:
-    """Return the path of the recording of each trace, by trace id, or raise an error for missing ones.
+    """Return the path of each trace's recording: trace id → path. Raise an error if some are missing.
 
     Raises
     ------
@@ -212,7 +212,7 @@ def _found(
 
 
 def _place(trace: OldTrace, candidates: dict[int, list[Path]]) -> Path | str:
-    """Return the path of the recording of a trace, or the reason why no usable file was found."""
+    """Return the path of a trace's recording. If no usable file exists, return the reason."""
     reason = "changed since it was ingested"
     try:
         mark = mark_of(trace.path)
@@ -232,7 +232,7 @@ def _place(trace: OldTrace, candidates: dict[int, list[Path]]) -> Path | str:
 
 
 def _by_size(folders: Sequence[str | Path]) -> dict[int, list[Path]]:
-    """Return the files in some folders, by file size, to find recordings that were moved."""
+    """Return the files in some folders, file size → paths, to search for moved recordings."""
     found: dict[int, list[Path]] = {}
     for path in recordings(folders) if folders else ():
         with suppress(OSError, TraceError):
@@ -278,7 +278,7 @@ def _settings(trace: OldTrace) -> Config:
 def _steps(
     traces: Sequence[OldTrace], places: dict[int, Path]
 ) -> Iterator[_ReadingStep | OldTrace]:
-    """Yield the traces to read together, and the imported traces, in the order of the old store."""
+    """Yield groups of traces to ingest together, and imported traces, in the order of the old store."""
     steps: list[_ReadingStep | OldTrace] = []
     alike = groupby(traces, key=lambda t: (t.digest, t.settings, t.since, t.until, t.map_id))
     for _, views in alike:
@@ -314,7 +314,7 @@ def _read(
     jobs: int,
     on_progress: Callable[[Progress], None] | None,
 ) -> None:
-    """Ingest the recordings of some traces into the new store. Traces that are already in it are skipped."""
+    """Ingest the recordings of a group of traces into the new store. Skip traces that it already has."""
     with _map_file(maps.get(step.map_id) if step.map_id is not None else None) as road_map:
         outcomes = ingest(
             fresh,
@@ -338,7 +338,7 @@ def _stopped(fresh: Path, wrong: list[str]) -> str:
 
 @contextmanager
 def _map_file(road_map: OldMap | None) -> Generator[Path | None]:
-    """Yield the path of a temporary file with a map of the old store, for recordings without a map."""
+    """Context manager: write a map of the old store to a temporary file, for recordings without a map."""
     if road_map is None or not road_map.text.lstrip("\ufeff \t\r\n").startswith("<"):
         yield None
         return

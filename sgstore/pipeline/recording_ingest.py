@@ -141,7 +141,7 @@ class TraceOutcome:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Self:
-        """Return the result of an ingest from its JSON values. An error keeps its class and message."""
+        """Return the ingest result that a JSON object contains. Errors keep their class and message."""
         told = values["error"]
         error = getattr(errors, told["class"])(told["message"]) if told else None
         changed: dict[str, Any] = {
@@ -157,7 +157,7 @@ class TraceOutcome:
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """Settings for the ingest of recordings, which worker processes receive.
+    """Settings for the ingest of recordings. Worker processes receive them.
 
     Attributes
     ----------
@@ -198,7 +198,7 @@ class Job:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Self:
-        """Return ingest settings from their JSON values."""
+        """Return the ingest settings that a JSON object contains."""
         road_map = values["road_map"]
         changed: dict[str, Any] = {
             "store": Path(values["store"]),
@@ -329,7 +329,7 @@ class _EgoView:
 
 
 class SegmentReader:
-    """Reader that converts recordings to segments (files of one trace each), one recording after another.
+    """Ingest of recordings, one after another. For each ego, it writes a segment (file of one trace).
 
     Parameters
     ----------
@@ -379,14 +379,14 @@ class SegmentReader:
         return found
 
     def _store(self) -> StoreFile | None:
-        """Return the store that may already have the traces. ``None`` means that every recording is read."""
+        """Return the store in which to look for existing traces; ``None`` if every recording must be read."""
         if self._file is None and self._job.store.exists():
             self._file = StoreFile(self._job.store)
         return None if self._job.force else self._file
 
     @cached_property
     def _request(self) -> str:
-        """Return all inputs that determine the trace of a recording, as JSON. Empty if other files matter, too.
+        """Return all inputs that determine a trace, as JSON. Empty if other files also determine it.
 
         A list of egos gives several traces. A folder of maps and a file of a mapping can change.
         """
@@ -397,7 +397,7 @@ class SegmentReader:
         return json.dumps([version("sgstore"), config.as_dict(), maps.digest, parts])
 
     def _present(self, path: Path) -> TraceOutcome | None:
-        """Return the result for a recording whose trace is already in the store, without opening the recording.
+        """Return the result for a recording whose trace is in the store. The recording is not opened.
 
         ``None`` means not known: the file has changed, or the trace was read by another request.
         """
@@ -439,7 +439,7 @@ class SegmentReader:
                     self._build(trace, group, road_map, config, folder / str(first))
 
     def _wanted(self, trace: MessageTrace, views: list[_EgoView]) -> Iterator[_EgoView]:
-        """Yield the egos of a recording that the settings select. The result of an unknown ego is an error."""
+        """Yield the egos of a recording that the settings select. Unknown names get a result with an error."""
         info, egos = trace.info, self._job.config.egos
         if not egos:
             views.append(_EgoView(TraceOutcome(info.path, ego=info.ego), info))
@@ -494,7 +494,7 @@ class SegmentReader:
         return found
 
     def _is_new(self, store: StoreFile, view: _EgoView, road_map: RoadMap | None) -> bool:
-        """True if the store has no trace of this recording and ego. Otherwise, set the status of the result."""
+        """True if the store has no trace of this recording and ego. Otherwise, the result gets a new status."""
         job, outcome = self._job, view.outcome
         try:
             shown = map_of_graphs(road_map, job.config)
@@ -606,7 +606,7 @@ class SegmentReader:
             outcome.status = "sealed"
 
     def _keep_topics(self, trace: MessageTrace, segments: Sequence[Segment]) -> list[Loss]:
-        """Write the messages of the configured topics to the segments, and return their losses."""
+        """Write the messages of the configured topics to the segments. Return the losses of these topics."""
         reading = TopicReading(trace.recording, self._job.config.topics)
         with ExitStack() as stack:
             writers = [stack.enter_context(segment.topics(reading)) for segment in segments]
@@ -620,12 +620,12 @@ class SegmentReader:
         ]
 
     def _meant(self, block: FrameBlock) -> FrameBlock:
-        """Return a block of frames with the configured mapping from type names to kinds applied."""
+        """Return a block of frames with the kinds that the settings define for type names."""
         return replace(block, entities=renamed(block.entities, self._job.config.types))
 
 
 def _kept(segments: Sequence[Segment], block: FrameBlock) -> FrameBlock:
-    """Return a block with the values that all segments store. They are equal for all egos."""
+    """Return a block in the form that a store keeps. It is equal for all egos."""
     kept, *_ = [segment.as_kept(block) for segment in segments]
     return kept
 
@@ -642,7 +642,7 @@ def _ego_of(block: FrameBlock, one: _EgoView) -> Ints:
 
 
 def _reached(frames: FrameBlock, size: int) -> int:
-    """Return the approximate number of bytes that have been read from the recording."""
+    """Return about how many bytes of the recording have been read."""
     messages = frames.messages
     places = np.where(messages.chunk_offset < 0, messages.offset, messages.chunk_offset)
     return min(int(places.max(initial=0)), size)
@@ -652,7 +652,7 @@ def _reached(frames: FrameBlock, size: int) -> int:
 
 
 def main() -> None:
-    """Ingest recordings in a worker process. The first request of the parent process is the job."""
+    """Main function of a worker process that ingests recordings. The parent's first request is the job."""
     asked = requests()
 
     def on_block(frames: int, reached: int, size: int) -> None:

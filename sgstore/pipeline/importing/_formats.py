@@ -246,7 +246,7 @@ class _EdgeTable:
         return f"row {self._number}, column {self._names[self._places[column]]}"
 
     def _text(self, column: str) -> str:
-        """Return the text of the current row in a column; empty if the column is missing."""
+        """Return the current row's text in a column; empty if the file lacks the column."""
         place = self._places[column]
         return self._row[place].strip() if place >= 0 else ""
 
@@ -349,7 +349,7 @@ def read_nodelink(path: Path) -> Iterator[GivenGraph]:
 
 
 def _documents(path: Path) -> Iterator[tuple[str, Any]]:
-    """Yield the JSON documents of a file, each with its place for messages, such as ``line 2``."""
+    """Yield the JSON documents of a file, each with a text for messages such as ``line 2``."""
     with lines_of(path) as lines:
         numbered = enumerate(lines, start=1)
         number, first = next((one for one in numbered if one[1].strip()), (0, ""))
@@ -374,7 +374,7 @@ def _documents(path: Path) -> Iterator[tuple[str, Any]]:
 
 
 def _whole(path: Path, line: int, lines: Iterator[str]) -> Iterator[tuple[str, Any]]:
-    """Yield the graph or graphs of a file that is one JSON document."""
+    """Yield the graphs in a file that is one JSON document: a single graph, or several."""
     parts = StringIO()
     values = 0
     for part in lines:
@@ -407,7 +407,7 @@ def _whole(path: Path, line: int, lines: Iterator[str]) -> Iterator[tuple[str, A
 
 
 def _values(text: str) -> int:
-    """Return an upper bound for the number of values in a JSON text, without parsing it."""
+    """Return an estimate, never too small, of the number of values in a JSON text, without parsing it."""
     return sum(map(text.count, "[{,"))
 
 

@@ -302,7 +302,7 @@ class _Labels:
     def _data(
         self, data: Mapping[str, Any], usual: str, where: str, axes: _FrameAxes
     ) -> dict[str, Any]:
-        """Return the node attributes in the data of an OpenLABEL element, with its pose in the root system."""
+        """Convert the data of an OpenLABEL element to node attributes, with its pose in the root system."""
         found: dict[str, Any] = {}
         boxes: dict[str, tuple[Any, str]] = {}
         for form, row in self._rows(data, where):
@@ -342,7 +342,7 @@ class _Labels:
         return [float(one) for one in value]
 
     def _time(self, about: Mapping[str, Any], where: str) -> int | None:
-        """Return the time of a frame in ns; ``None`` means that the file has none.
+        """Return the time of a frame; ns. If the file has no time for it, ``None``.
 
         The unit of a number (s, ms, µs or ns since 1970) follows from its size. Seconds may have
         another origin.
@@ -388,7 +388,7 @@ class _Axes:
         self._systems = {name: of if isinstance(of, dict) else {} for name, of in systems.items()}
 
     def at(self, transforms: Mapping[str, Any]) -> _FrameAxes:
-        """Return the coordinate systems for one frame, whose transforms can change their poses."""
+        """Return the coordinate systems in one frame. Its transforms can change their poses."""
         moved: dict[tuple[str, str], NDArray[np.float64]] = {}
         for told in transforms.values():
             if isinstance(told, dict):
@@ -486,7 +486,7 @@ def _turn(told: list[float]) -> NDArray[np.float64]:
 
 
 def _in_sequence(sequence: str, angles: list[float]) -> NDArray[np.float64]:
-    """Return the rotation matrix for successive rotations in radians, each about an already rotated axis."""
+    """Return the matrix of successive rotations in radians. Each is about an axis that was rotated before."""
     made = np.eye(3)
     for letter, angle in zip(sequence, angles, strict=True):
         axis = "XYZ".index(letter)
@@ -499,7 +499,7 @@ def _in_sequence(sequence: str, angles: list[float]) -> NDArray[np.float64]:
 
 
 def _matrix(told: Any) -> NDArray[np.float64] | None:
-    """Return the (4, 4) matrix of an OpenLABEL transform; ``None`` means invalid data."""
+    """Return the (4, 4) matrix of an OpenLABEL transform; ``None`` if its data are invalid."""
     if not isinstance(told, dict):
         return None
     try:

@@ -105,7 +105,7 @@ class GivenEdge:
 
 @dataclass(slots=True)
 class GivenGraph:
-    """Imported graph as in its file: name, time, nodes and edges. It becomes a frame.
+    """Imported graph of a file: name, time, nodes and edges. It will be one frame of a trace.
 
     Attributes
     ----------
@@ -137,7 +137,7 @@ class GivenGraph:
 
 
 def check_size(path: Path, where: str, graph: GivenGraph) -> None:
-    """Raise an error if an imported graph has too many nodes, edges or characters of names.
+    """Raise an error if an imported graph has too many nodes or edges, or too long names.
 
     Raises
     ------
@@ -154,7 +154,7 @@ def check_size(path: Path, where: str, graph: GivenGraph) -> None:
 
 
 def wrong(path: Path, where: str, reason: str) -> TraceError:
-    """Return an error for a place in an imported file, with the reason."""
+    """Return an error with a reason, and with the place in the imported file."""
     return TraceError(f"{where}: {reason}" if where else reason, path=path)
 
 
@@ -205,7 +205,7 @@ OWN: Final = "own"
 
 @dataclass(frozen=True, slots=True)
 class LabelMeaning:
-    """Meaning of a node label in an imported file: a kind of sgstore, with details.
+    """Meaning of a node label in an imported file: a node kind of sgstore, and details.
 
     Attributes
     ----------
@@ -275,7 +275,7 @@ class Words:
         return known or ""
 
     def meaning(self, name: str, label: str) -> LabelMeaning | None:
-        """Return the kind of sgstore that a node label of a file means. ``None`` means unknown."""
+        """Return sgstore's node kind for a node label in a file; ``None`` if the label is unknown."""
         for text in dict.fromkeys((label, name) if label else (name, _plain(name))):
             found = self._meant(text)
             if found is not None:
@@ -301,7 +301,7 @@ class Words:
         return _simulators(text)
 
     def relation(self, name: str) -> str | None:
-        """Return the relation of sgstore that a relation name of a file means. ``None`` means unknown."""
+        """Return sgstore's relation for a relation name in a file; ``None`` if the name is unknown."""
         given = {normalize_name(own): relation for own, relation in self.relations.items()}
         known = relation_named(given.get(normalize_name(name), name))
         return _own_relation(name) if known is None and self.unknown_as == OWN else known
@@ -358,7 +358,7 @@ def _own_kind(text: str) -> str:
 
 
 def _own_relation(text: str) -> str | None:
-    """Register a name as a new relation, and return the relation; ``None`` means an invalid name."""
+    """Register a name as a new relation, and return the relation; ``None`` if the name is not valid."""
     name = _NO_NAME.sub("_", text).strip("_")
     known = relation_named(name)
     with suppress(ValueError):
@@ -372,7 +372,7 @@ def _kind(text: str) -> str:
 
 
 def _simulators(text: str) -> LabelMeaning | None:
-    """Return the meaning of a simulator's type name, such as ``vehicle.audi.tt``.
+    """Return the kind and details for a simulator's type name, such as ``vehicle.audi.tt``.
 
     The longest known part before a dot counts. ``None`` means unknown.
     """
@@ -441,7 +441,7 @@ Own = dict[str, Any]
 def state_of(
     path: Path, where: str, attributes: Mapping[str, Any], lost: dict[str, int], *, any_state: bool
 ) -> tuple[dict[str, float], Own]:
-    """Return the state of an imported entity in a frame, and its attributes without a column in the store.
+    """Return an imported entity's state in a frame, and its attributes without a column in the store.
 
     The columns are those of :class:`sgstore.model.world.States`. With ``any_state``, traffic lights may have
     states outside the vocabulary.
@@ -501,7 +501,7 @@ def _speed(attributes: Mapping[str, Any], found: dict[str, float], lost: dict[st
 
 
 def part_of(path: Path, where: str, attributes: Mapping[str, Any]) -> tuple[dict[str, Any], Own]:
-    """Return the attributes of an imported map part: those with a column in the store, and the others.
+    """Return the attributes of an imported map part, in two groups: store columns, and all others.
 
     The columns are those of :class:`sgstore.maps.roads.MapNodes`.
 
@@ -534,7 +534,7 @@ def part_of(path: Path, where: str, attributes: Mapping[str, Any]) -> tuple[dict
 def lane_state_of(
     path: Path, where: str, attributes: Mapping[str, Any]
 ) -> tuple[dict[str, float], Own]:
-    """Return the position of an entity in a lane from an edge's attributes, and the other attributes.
+    """Split the attributes of an edge: the position of an entity in a lane, and all others.
 
     ``primary`` is 1 or 0; it is absent if the file does not contain it.
     """
@@ -553,7 +553,7 @@ def lane_state_of(
 
 
 def gap_of(path: Path, where: str, attributes: Mapping[str, Any]) -> tuple[float, Own]:
-    """Return the gap attribute of a ``leads`` or ``follows`` edge, and its other attributes.
+    """Split the attributes of a ``leads`` or ``follows`` edge: the gap, and all others.
 
     NaN means an unknown gap.
     """
@@ -612,7 +612,7 @@ Part = tuple[str, str]
 
 @dataclass(slots=True)
 class Meant:
-    """Imported graph in which labels and relations are replaced by kinds and relations of sgstore.
+    """Imported graph after its labels and relation names were replaced by those of sgstore.
 
     Attributes
     ----------
@@ -635,7 +635,7 @@ class Meant:
 
 
 class Understanding:
-    """Converter from the labels and relations of a file to the kinds and relations of sgstore."""
+    """Converter from the node labels and relation names of a file to those of sgstore."""
 
     def __init__(self, path: Path, words: Words) -> None:
         self._path = path
@@ -704,7 +704,7 @@ class Understanding:
 
 @dataclass(slots=True)
 class FileMeaning:
-    """Result of the first pass over an imported file: number of graphs, map parts, relations and ego.
+    """Result of a first reading of an imported file: number of graphs, map parts, relations and ego.
 
     Attributes
     ----------
@@ -727,7 +727,7 @@ class FileMeaning:
 
 
 def survey(path: Path, graphs: Iterable[GivenGraph], words: Words) -> FileMeaning:
-    """Read all graphs of a file once, and return the facts that they share. Raise the first error.
+    """Read all graphs of a file once. Return its graph count, map parts, relations and ego.
 
     Raises
     ------

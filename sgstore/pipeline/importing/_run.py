@@ -278,7 +278,7 @@ class _ImportRun:
         return graph
 
     def _variant(self, found: FileMeaning) -> str:
-        """Return a JSON text that identifies the map of an imported file: its parts and import options."""
+        """Return a JSON text that is equal for files with the same map: map parts and import options."""
         about = {
             "of": self._form,
             "words": self._words.as_dict(),
@@ -290,7 +290,7 @@ class _ImportRun:
 
 
 def _blocks(graphs: Iterable[Meant]) -> Iterator[list[Meant]]:
-    """Yield graphs in blocks of limited total size."""
+    """Yield groups of consecutive graphs. The total size of a group is limited."""
     some: list[Meant] = []
     size = 0
     for graph in graphs:
@@ -317,7 +317,7 @@ _LONGEST_VALUE: Final = 10_000
 
 
 def parts_map(name: str, variant: str, parts: Mapping[Part, Mapping[str, Any]]) -> RoadMap:
-    """Return a road map that contains only the names of the imported lanes and roads, without geometry.
+    """Return a road map with only the names of the imported lanes and roads, without their shapes.
 
     Parameters
     ----------
@@ -389,7 +389,7 @@ class Blocks:
         self._seq = 0
 
     def block(self, graphs: Sequence[Meant]) -> GraphBlock:
-        """Return the given imported graphs as a block of frames. Lost values are counted for each graph."""
+        """Return imported graphs as a block of frames. For each graph, count the values that are lost."""
         new: list[tuple[GivenNode, LabelMeaning]] = []
         self.own = []
         first = len(self._entities)
@@ -451,7 +451,7 @@ class Blocks:
                 lost[what] = lost.get(what, 0) + 1
 
     def _ids(self, meant: Meant, new: list[tuple[GivenNode, LabelMeaning]]) -> dict[str, int]:
-        """Return the node id of each node name of a graph, and add new entities to the list ``new``."""
+        """Return each node's id by its name in a graph. Append new entities to the list ``new``."""
         found = {name: self._parts[part] for name, part in meant.parts.items()}
         for name, (node, meaning) in meant.entities.items():
             key = (name, meaning.kind)
@@ -550,5 +550,5 @@ def _lane_states(inside: Mapping[tuple[int, int, int], dict[str, float]]) -> Lan
 
 
 def _whole(rows: Sequence[tuple[int, ...]], width: int) -> list[Ints]:
-    """Return rows of integers as columns, each an int64 array."""
+    """Return the values of each column in rows of integers, as int64 arrays."""
     return list(np.array(rows, np.int64).reshape(-1, width).T.copy())
