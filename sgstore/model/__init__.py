@@ -1,1 +1,1 @@
-"""Data model: states of objects, scene graphs, vocabulary, settings, and measures of object pairs."""
+"""Data model: object states, scene graphs, vocabulary, settings, and measures of object pairs."""

@@ -40,7 +40,7 @@ def frame_ids(trace_id: int | Ints, seq: Ints) -> Ints:
 
 
 def frames_of(bucket: Ints, mask: Ints) -> tuple[Ints, Ints]:
-    """Return the frame ids that bit masks of 64 frames contain, and the row of the mask for each."""
+    """Convert bit masks of 64 frames each to frame ids. Also return the row of the mask for each id."""
     ids: list[Ints] = []
     rows: list[Ints] = []
     for bit in range(BUCKET_FRAMES):
@@ -51,18 +51,18 @@ def frames_of(bucket: Ints, mask: Ints) -> tuple[Ints, Ints]:
 
 
 def trace_of(frame_id: Ints) -> Ints:
-    """Return the trace id of each frame id."""
+    """Return the trace id that is part of each frame id."""
     return frame_id >> SEQ_BITS
 
 
 def seq_of(frame_id: Ints) -> Ints:
-    """Return the frame number (in its trace) of each frame id."""
+    """Return the frame number (in its trace) that is part of each frame id."""
     bucket = (frame_id >> FRAME_BITS) & ((1 << BUCKET_BITS) - 1)
     return bucket * BUCKET_FRAMES + (frame_id & ((1 << FRAME_BITS) - 1))
 
 
 def begins(frame_id: Ints) -> Bools:
-    """Return a mask (N,) of the frames that do not directly follow the frame in the previous row."""
+    """Return a mask (N,): True if a frame does not directly follow the frame in the previous row."""
     trace, seq = trace_of(frame_id), seq_of(frame_id)
     found = np.ones(len(frame_id), np.bool_)
     found[1:] = (trace[1:] != trace[:-1]) | (seq[1:] != seq[:-1] + 1)

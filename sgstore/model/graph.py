@@ -1,4 +1,4 @@
-"""Scene graphs as columns (blocks of frames, for the store) and as single frames (for callers, networkx)."""
+"""Scene graphs as columns (for blocks of frames and the store), and as objects (for single frames)."""
 
 from __future__ import annotations
 
@@ -61,12 +61,12 @@ class Edges:
         return len(self.frame)
 
     def distinct(self) -> Edges:
-        """Return each edge once, sorted by frame, source, relation and destination."""
+        """Return the edges without duplicates, sorted by frame, source, relation and destination."""
         every, new = _ordered(self)
         return taken(every, new)
 
     def differing(self, other: Edges) -> Edges:
-        """Return the edges that only one of two edge tables has."""
+        """Return the edges that occur in only one of two edge tables."""
         every, new = _ordered(Edges.chained([self.distinct(), other.distinct()]))
         return taken(every, new & np.append(new[1:], True)[: len(new)])
 
@@ -85,7 +85,7 @@ class Edges:
 
 
 def _ordered(edges: Edges) -> tuple[Edges, NDArray[np.bool_]]:
-    """Return sorted edges, and a mask of the rows that differ from the previous row."""
+    """Return the sorted edges, and a mask of the first of equal rows."""
     order = np.lexsort((edges.dst, edges.relation, edges.src, edges.frame))
     every = taken(edges, order)
     return every, begins(every.frame, every.src, every.relation, every.dst)
@@ -93,7 +93,7 @@ def _ordered(edges: Edges) -> tuple[Edges, NDArray[np.bool_]]:
 
 @dataclass(frozen=True, slots=True)
 class LaneGaps:
-    """Gaps along lanes between a following object and the object ahead; shape (K,).
+    """Gaps along lanes between a following object and the object in front of it; shape (K,).
 
     Attributes
     ----------
@@ -116,7 +116,7 @@ class LaneGaps:
 
 @dataclass(frozen=True, slots=True)
 class StaticPresence:
-    """Pairs of a frame and a static node (static object or map part) in its graph; shape (M,).
+    """Static nodes (static objects and map parts) in the graph of each frame: one row per node and frame; (M,).
 
     Attributes
     ----------
@@ -176,7 +176,7 @@ class LaneStates:
 
 @dataclass(frozen=True, slots=True)
 class WorldBlock:
-    """Nodes and edges outside the graphs of a block of frames, for queries about distant objects.
+    """Nodes and edges outside the graphs of some frames, for queries about distant objects.
 
     Attributes
     ----------
@@ -205,7 +205,7 @@ class WorldBlock:
 
 @dataclass(frozen=True, slots=True)
 class LeftOut:
-    """Counts of recorded object states that the settings exclude from the graphs, without static objects.
+    """Counts of recorded object states that the settings exclude from the graphs. Static objects do not count.
 
     Attributes
     ----------
@@ -282,7 +282,7 @@ class GraphBlock:
 def graph_of_records(
     nodes: Iterable[Mapping[str, Any]], edges: Iterable[Mapping[str, Any]], **about: Any
 ) -> nx.MultiDiGraph[Any]:
-    """Return a ``networkx.MultiDiGraph`` from records of nodes and edges (node-link form).
+    """Return a ``networkx.MultiDiGraph`` from records of nodes and edges (node-link format).
 
     Parameters
     ----------
@@ -307,7 +307,7 @@ def graph_of_records(
 def named_graph(
     nodes: Mapping[str, str], edges: Iterable[tuple[str, str, str]], **about: Any
 ) -> nx.MultiDiGraph[str]:
-    """Return a ``networkx.MultiDiGraph`` from node labels and named edges, as in the literature.
+    """Return a ``networkx.MultiDiGraph`` from labels of nodes and named edges, as in the literature.
 
     Parameters
     ----------
@@ -337,7 +337,7 @@ def named_graph(
 
 
 def _grouped(pairs: Iterable[tuple[K, V]]) -> dict[K, list[V]]:
-    """Return the values of each key, in the order of the pairs."""
+    """Group pairs by key: key → its values, in the order of the pairs."""
     found: dict[K, list[V]] = {}
     for key, value in pairs:
         found.setdefault(key, []).append(value)
@@ -345,7 +345,7 @@ def _grouped(pairs: Iterable[tuple[K, V]]) -> dict[K, list[V]]:
 
 
 class LaneDistances:
-    """Distances along the lanes of a map: between lanes, to map parts, with curvature and slope.
+    """Distances along the lanes of a map, between lanes and to map parts. Also curvature and slope.
 
     Parameters
     ----------
@@ -397,7 +397,7 @@ class LaneDistances:
 
     @cached_property
     def _of_lanes(self) -> dict[int, list[tuple[float, float, float | None]]]:
-        """Intervals of each lane with constant curvature: start (m), curvature (1/m) and slope."""
+        """Intervals of each lane with constant curvature: start (m), curvature (1/m) and slope of each."""
         found: dict[int, list[tuple[float, float, float | None]]] = {}
         for lane, start, curvature, slope in self._courses:
             known = None if slope is None or math.isnan(slope) else slope
@@ -407,7 +407,7 @@ class LaneDistances:
         return found
 
     def tells(self, what: str) -> bool:
-        """Return True if the map has data of a kind: ``ways`` (connections), ``curvature`` or ``slope``."""
+        """Return True if the map has some data: ``ways`` (lane connections), ``curvature`` or ``slope``."""
         return what in self._told
 
     @cached_property
@@ -418,14 +418,14 @@ class LaneDistances:
         return frozenset(what for what, is_known in known.items() if is_known)
 
     def course(self, lane: int, along: float) -> tuple[float | None, float | None]:
-        """Return curvature (1/m) and slope of a lane at a position along it. ``None`` means unknown."""
+        """Return curvature (1/m) and slope of a lane at a position along it. Each is ``None`` if unknown."""
         stretches = self._of_lanes.get(lane, ())
         if not stretches:
             return None, None
         return stretches[bisect_right(stretches, max(along, 0.0), key=itemgetter(0)) - 1][1:]
 
     def stretches(self, node: int) -> Stretches:
-        """Return the lanes that a map part lies on, with its start and end along each lane; m."""
+        """Return the lanes on which a map part lies, with its start and end along each lane; m."""
         return self._of_parts.get(node, ())
 
     def stretches_of(self, what: str, lane: int) -> Sequence[tuple[float, float]]:
@@ -433,12 +433,12 @@ class LaneDistances:
         return self._on_lanes.get((what, lane), ())
 
     def distance(self, one: Places, other: Places) -> float | None:
-        """Return the distance along lanes between two objects; m. ``None`` means without a connection."""
+        """Return the distance along lanes between two objects; m. ``None`` if no lanes connect them."""
         ends = ([(lane, along, along) for lane, along in places] for places in (one, other))
         return self.between(*ends)
 
     def between(self, one: Stretches, other: Stretches) -> float | None:
-        """Return the gap along lanes between two lane intervals; m. ``None`` means without a connection.
+        """Return the gap along lanes between two lane intervals; m. ``None`` if no lanes connect them.
 
         Overlap gives 0; a stretch behind is negative.
         """
@@ -456,7 +456,7 @@ class LaneDistances:
         return nearest if abs(nearest) <= self.FARTHEST else None
 
     def next(self, one: Stretches, what: str) -> float | None:
-        """Return the distance along lanes to the next map part of a kind, such as crosswalk; m. 0 on it."""
+        """Return the distance along lanes to the next map part of a kind (such as crosswalk); m. 0 on it."""
         found = math.inf
         for lane, first, last in one:
             for to, way in self._onward.get(lane, ()):
@@ -467,7 +467,7 @@ class LaneDistances:
 
 
 class EdgeColumns(Sequence["EdgeRecord"]):
-    """Edges of one scene graph, stored as columns. The object of an edge is created when it is accessed.
+    """Edges of one scene graph, stored as columns. An edge object is created only on access.
 
     A record takes about 250 bytes, a row ten. The object equals any sequence of the same records.
 
@@ -594,7 +594,7 @@ class SceneGraph:
     unsure_lead: frozenset[int] = field(default=frozenset(), compare=False, repr=False)
 
     def known(self) -> SceneGraph:
-        """Return the scene graph of all known objects, also of those outside the range of this graph.
+        """Return the scene graph of all known objects, including those outside the range of this graph.
 
         Outside this graph, only the edges ``isIn``, ``controlsTrafficOf``, ``leads``, ``follows`` and map edges
         exist.
@@ -662,7 +662,7 @@ class SceneGraph:
         return known
 
     def lane_dist(self, a: int, b: int) -> float | None:
-        """Return the distance along lanes between two objects or map parts; m. ``None`` means unknown.
+        """Return the distance along lanes between two objects or map parts; m. ``None`` if unknown.
 
         Measured from centre to centre along the centre lines of their own lanes (:attr:`LaneStates.own`) and
         the lanes connected by ``travelsTo``. Positive if the route leads from a to b, negative from b to a; the
@@ -685,7 +685,7 @@ class SceneGraph:
         return self.reach.between(*ends)
 
     def to_next(self, node: int, what: str) -> float | None:
-        """Return the distance along lanes to the next map part of a kind, such as crosswalk; m. 0 on the part.
+        """Return the distance along lanes to the next map part of a kind (such as crosswalk); m. 0 on it.
 
         ``what`` is ``junction``, ``roundabout``, ``crosswalk``, ``stop_line``, ``traffic_light``, …; ``None``
         means none within 200 m.

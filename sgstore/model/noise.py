@@ -1,4 +1,4 @@
-"""Motion computed from noisy positions: noise of a recording, smooth velocities, and standing vehicles.
+"""Computation of motion from noisy positions: noise of a recording, smooth velocities, standing vehicles.
 
 Positions of measured recordings tremble, those of simulators do not. :func:`noise_of` estimates the noise
 from the first frames. :class:`Smoother` fits polynomials to the noisy positions around each frame.
@@ -71,7 +71,7 @@ FROM_POSITIONS: Final = ("position_speed", "position_accel", "position_yaw_rate"
 
 
 class Noise(NamedTuple):
-    """Noise of the positions of a recording.
+    """Noise of the recorded positions of bodies.
 
     Attributes
     ----------
@@ -89,16 +89,16 @@ class Noise(NamedTuple):
 
     @property
     def enter(self) -> float:
-        """Speed below which a moving body starts to count as standing; m/s."""
+        """Speed below which a moving body counts as standing; m/s."""
         return float(np.clip(0.1 + 3 * self.wander, 0.1, 0.35))
 
     @property
     def leave(self) -> float:
-        """Speed above which a standing body counts as moving again; m/s."""
+        """Speed above which a standing body counts as moving; m/s."""
         return 1.3 * self.enter
 
     def half(self, period: float) -> float:
-        """Return half the length of the shortest window in which the noise of velocities is small enough; s."""
+        """Return half the length of the shortest time window that reduces the noise of velocities enough; s."""
         most = max(1, min(MOST_ROWS, int(WIDE / period)))
         squares = 2 * np.cumsum(np.arange(1, most + 1) ** 2.0)
         calm = self.jitter / (period * np.sqrt(squares)) <= CALM
@@ -107,7 +107,7 @@ class Noise(NamedTuple):
 
 @dataclass(slots=True)
 class Tracks:
-    """States sorted by node and time. A track is divided where the body cannot have moved so far.
+    """States of bodies, sorted by body and time. A track is divided at movements that are too fast.
 
     Attributes
     ----------
@@ -146,7 +146,7 @@ class Tracks:
         jitter: float,
         period: float,
     ) -> Tracks:
-        """Return the tracks of the states in some frames. See :meth:`Smoother.fill` for the arguments."""
+        """Group the states of some frames into one track per body. See :meth:`Smoother.fill` for arguments."""
         order = np.lexsort([frame, node])
         # Whole nanoseconds: differences are then the same in every block.
         clock = np.cumsum(np.rint(np.where(seconds > 0, seconds, 0.0) * 1e9).astype(np.int64))
@@ -177,17 +177,17 @@ class Tracks:
         )
 
     def shifted(self, by: int) -> tuple[Ints, Bools]:
-        """Return the rows that are ``by`` places later in the same track part, and a mask of existing ones."""
+        """Return the rows ``by`` places later, and a mask: True if that row is in the same part of a track."""
         rows = np.arange(len(self.order)) + by
         there = np.clip(rows, 0, len(rows) - 1)
         return there, (rows == there) & (self.part[there] == self.part) & self.used[there]
 
     def most(self, half: float) -> int:
-        """Return the largest number of frames on each side of a window."""
+        """Return the number of frames on each side of a window, at most."""
         return min(MOST_ROWS, round(half / self.period))
 
     def fits(self, values: Floats, half: float, degree: int, turn: float = 0.0) -> Fit:
-        """Fit a polynomial by least squares to the values around each row.
+        """Fit a polynomial to the values around each row, by least squares.
 
         Parameters
         ----------
@@ -228,7 +228,7 @@ class Tracks:
 
 @dataclass(slots=True)
 class Fit:
-    """Polynomials fitted around rows: first and second derivative at the middle of their windows.
+    """Polynomials fitted around each row: first and second derivative in the middle of the window.
 
     Attributes
     ----------
@@ -250,7 +250,7 @@ class Fit:
 
     @classmethod
     def of(cls, sums: Floats, moments: Floats, span: Floats) -> Fit:
-        """Compute the polynomials from sums of powers of time and from moments of the values."""
+        """Compute the polynomials from sums of powers of time, and from weighted sums of the values."""
         with np.errstate(all="ignore"):
             middle = sums[1] / sums[0]
             degree = len(moments) - 1
@@ -277,7 +277,7 @@ class Fit:
         return cls(slope, bend, middle, span, loose)
 
     def instead(self, other: Fit, rows: Bools) -> Fit:
-        """Return the fits, with some rows replaced by those of another fit."""
+        """Return these fits. In some rows, use those of another fit instead."""
         return Fit(
             np.where(rows[:, None], other.slope, self.slope),
             np.where(rows[:, None], other.bend, self.bend),
@@ -288,7 +288,7 @@ class Fit:
 
 
 def _jumps(time: Ints, place: Floats, part: Ints, jitter: float) -> Bools:
-    """Return a mask of the rows whose distance from the row before is too large for a movement."""
+    """Return a mask of the rows that are too far from the row before for a real movement."""
     step = np.diff(time) / 1e9
     moved = np.diff(place, axis=0)
     whole = np.diff(part) == 0
@@ -307,7 +307,7 @@ def _jumps(time: Ints, place: Floats, part: Ints, jitter: float) -> Bools:
 
 
 def _median(values: Floats) -> Floats:
-    """Return the median over the first axis, ignoring NaN. It is NaN if all values are NaN."""
+    """Return the median over the first axis without NaN values. It is NaN if all values are NaN."""
     ranked = np.sort(values, axis=0)
     count = np.isfinite(values).sum(axis=0)
     low, high = np.maximum(count - 1, 0) // 2, np.minimum(count // 2, len(values) - 1)
@@ -319,7 +319,7 @@ def _nth(values: Floats, which: Ints) -> Floats:
 
 
 def _close(time: Ints, place: Floats, rows: Ints, jitter: float) -> Bools:
-    """Return a mask of rows that are outliers: without them, their neighbours on both sides fit together."""
+    """Return a mask of outliers: rows without which the rows before and after fit together."""
     inside = (rows >= 2) & (rows + 2 < len(time))
     rows = np.clip(rows, 2, max(2, len(time) - 3))
     with np.errstate(all="ignore"):  # Rows of other bodies and times do not count.
@@ -334,7 +334,7 @@ def _close(time: Ints, place: Floats, rows: Ints, jitter: float) -> Bools:
 
 @dataclass(slots=True)
 class GapFiller:
-    """Base class that fills in missing motion of noisy bodies. Subclasses estimate the motion from positions.
+    """Base class: fills in missing motion of bodies. Subclasses estimate it from noisy positions.
 
     Parameters
     ----------
@@ -356,7 +356,7 @@ class GapFiller:
     apart: Ints = field(default_factory=lambda: np.zeros(5001, np.int64))
 
     def second(self, values: Floats, found: Floats) -> list[Mapping[str, float] | None]:
-        """Return motion computed from positions as attributes, for rows whose velocity is also recorded."""
+        """Return motion computed from positions as extra attributes, for rows with recorded velocity."""
         added: list[Mapping[str, float] | None] = [None] * len(values)
         rows = np.flatnonzero(np.isfinite(values[:, _VELOCITY]))
         if not len(rows):
@@ -381,7 +381,7 @@ class GapFiller:
     def filled(
         self, values: Floats, found: Floats, fixed: Bools, stands: Bools
     ) -> tuple[Floats, Ints]:
-        """Return the values with missing motion filled in, and their bits ``derived``."""
+        """Fill in missing motion of bodies. Return the values, and bits ``derived`` of computed values."""
         wanted, derived = values.copy(), np.zeros(len(values), np.int64)
         for bit, (column, first, width) in enumerate(
             ((_VELOCITY, 0, 3), (_ACCELERATION, 3, 3), (_YAW_RATE, 6, 1))
@@ -433,13 +433,13 @@ class Smoother(GapFiller):
 
     @property
     def reach(self) -> int:
-        """Number of frames before and after a frame that its values depend on."""
+        """Number of frames before and after a frame that influence its values."""
         return min(MOST_ROWS, int(np.ceil(WIDE / self.period))) + 3
 
     def fill(
         self, node: Ints, frame: Ints, seconds: Floats, values: Floats, fixed: Bools, rows: slice
     ) -> tuple[Floats, Ints, list[Mapping[str, float] | None]]:
-        """Return the values of rows with missing motion filled in, their bits ``derived``, and attributes.
+        """Fill in missing motion. Return the values, bits ``derived`` of computed values, and attributes.
 
         Parameters and result are those of :func:`sgstore.readers._blocks.derive`. The attributes are motion
         from positions, of rows whose motion is recorded.
@@ -467,7 +467,7 @@ class Smoother(GapFiller):
         return filled, derived, self.second(values[rows], found)
 
     def _standing(self, node: Ints, frame: Ints, speed: Floats) -> Bools:
-        """Return a mask of the rows with a standing body: slow enough, or not faster since it stood still."""
+        """Return a mask of the rows with a standing body: slow, or not yet fast enough to count as moving."""
         enter, leave = self.noise.enter, self.noise.leave
         sure = np.where(speed <= enter, 1, np.where(speed > leave, -1, 0))
         order = np.lexsort([frame, node])
@@ -490,12 +490,12 @@ PLACE: Final = 3.0
 
 
 def dead_band(noise: float, derived: Ints) -> Floats:
-    """Return the half width of the dead band of places, from bits ``derived``: (n,); m. 0: exact."""
+    """Return half the width of the dead band of positions, (n,); m. 0 for a position that was not smoothed."""
     return np.where(derived & SMOOTHED > 0, PLACE * noise, 0.0)
 
 
 class DeadBand:
-    """Places of noisy bodies that follow only moves beyond a dead band.
+    """Filter of noisy positions with a dead band: a returned position moves only if the input leaves the band.
 
     Each returned place is within the band of the position. A lane therefore does not change by noise.
     """
@@ -508,7 +508,7 @@ class DeadBand:
         self._last: dict[int, tuple[float, ...]] = {}
 
     def held(self, node: Ints, frame: Ints, place: Floats, heading: Floats, band: Floats) -> Floats:
-        """Return the held places of bodies.
+        """Return the filtered positions of bodies.
 
         Parameters
         ----------
@@ -543,7 +543,7 @@ class DeadBand:
 
 
 def noise_of(node: Ints, frame: Ints, seconds: Floats, values: Floats, fixed: Bools) -> Noise:
-    """Estimate the noise of positions. See :meth:`Smoother.fill` for the parameters.
+    """Estimate the noise of positions. See :meth:`Smoother.fill` for the arguments.
 
     A noisy body that stands stays within a metre for two seconds, and turns back on its way. Bodies of a
     simulator stay exactly, or move on. Third differences show the noise from frame to frame.
@@ -571,7 +571,7 @@ def noise_of(node: Ints, frame: Ints, seconds: Floats, values: Floats, fixed: Bo
 
 
 def _jitter(tracks: Tracks) -> tuple[float, bool]:
-    """Return the noise from frame to frame (m), and True if positions are interpolated between kinks."""
+    """Return the noise from frame to frame (m), and True if positions look interpolated between few points."""
     place, n = tracks.place[:, :2], len(tracks.place)
     if n < 20:
         return 0.0, False

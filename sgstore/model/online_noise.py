@@ -1,4 +1,4 @@
-"""Motion computed from noisy positions without later frames: online version of :mod:`sgstore.model.noise`.
+"""Motion from noisy positions without later frames: online version of :mod:`sgstore.model.noise`.
 
 Notes
 -----
@@ -53,7 +53,7 @@ _VELOCITY: Final = POSE.index("vx")
 
 @dataclass(slots=True)
 class _Followed:
-    """State of the filter for each body of the last frames, sorted by node.
+    """Filter state of each body seen in the last frames, sorted by node id.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ class _Followed:
 
     @classmethod
     def new(cls, node: Ints, place: Floats, now: float, variance: float) -> _Followed:
-        """Return the initial filter state of bodies that are seen for the first time."""
+        """Return the filter state of bodies in their first frame."""
         n = len(node)
         mean, sums = np.zeros((n, 3, 4)), np.zeros((n, 3))
         mean[:, 0], sums[:, 0] = np.nan_to_num(place), 1.0
@@ -97,14 +97,14 @@ class _Followed:
         return cls(*seen, no, no.copy())
 
     def put(self, rows: Ints | Bools, other: _Followed) -> None:
-        """Replace some rows by the rows of another table. The node ids stay."""
+        """Overwrite some rows with the rows of another table. The node ids stay as they are."""
         for column in fields(self)[1:]:
             getattr(self, column.name)[rows] = getattr(other, column.name)
 
 
 @dataclass(slots=True)
 class OnlineSmoother(GapFiller):
-    """Velocities, accelerations and yaw rates computed from earlier noisy positions, frame by frame."""
+    """Velocities, accelerations and yaw rates computed from noisy positions, without later frames."""
 
     _clock: float = 0.0
     _bodies: _Followed = field(
@@ -114,7 +114,7 @@ class OnlineSmoother(GapFiller):
     def fill(
         self, node: Ints, frame: Ints, seconds: Floats, values: Floats, fixed: Bools, rows: slice
     ) -> tuple[Floats, Ints, list[Mapping[str, float] | None]]:
-        """Return the values of the next frames with missing motion filled in, their bits, and attributes.
+        """Fill in missing motion in the next frames. Return the values, bits ``derived``, and attributes.
 
         Parameters and result are those of :meth:`sgstore.model.noise.Smoother.fill`.
         """
@@ -132,7 +132,7 @@ class OnlineSmoother(GapFiller):
         return filled, derived, self.second(values, found)
 
     def smoothed(self, block: FrameBlock, node: Ints, seconds: float) -> FrameBlock:
-        """Return a block of one frame with motion filled in. ``seconds``: time since the last frame.
+        """Return a block of one frame with motion filled in. ``seconds``: time since the frame before.
 
         Rows that a reader has smoothed stay the same.
         """
@@ -150,7 +150,7 @@ class OnlineSmoother(GapFiller):
         return replace(block, states=moved, noise=max(self.noise))
 
     def _step(self, node: Ints, seconds: float, place: Floats) -> tuple[Floats, Bools]:
-        """Return velocity, acceleration and yaw rate of the next frame's bodies, and a mask: which stand."""
+        """Return velocity, acceleration, yaw rate of the next frame's bodies, and a mask of standing ones."""
         before, step = self._bodies, seconds if seconds > 0 else self.period
         variance, calm = self._white(step)
         longest = max(HALF, 3.01 * step) if seconds > 0 else -1.0
@@ -168,7 +168,7 @@ class OnlineSmoother(GapFiller):
         return motion
 
     def _white(self, step: float) -> tuple[float, float]:
-        """Return the variance of equivalent white noise, and the time constant of the weights; s."""
+        """Return the variance of white noise with the same effect, and the time constant of the weights; s."""
         jitter, wander = self.noise
         slow = max(0.0, wander**2 - jitter**2) * max(1.0, HALF / step)
         variance = jitter**2 + slow
@@ -178,7 +178,7 @@ class OnlineSmoother(GapFiller):
     def _followed(
         self, bodies: _Followed, place: Floats, variance: float, calm: float
     ) -> _Followed:
-        """Return the filter state of known bodies after the next frame."""
+        """Return the filter state of already known bodies after the next frame."""
         step = self._clock - bodies.seen
         mean, spread = _predicted(bodies, step)
         rest = place - mean[:, 0]
@@ -221,7 +221,7 @@ class OnlineSmoother(GapFiller):
 
 
 def _predicted(bodies: _Followed, step: Floats) -> tuple[Floats, Floats]:
-    """Return the predicted mean and covariance after a time ``step`` (s), by Singer's motion model."""
+    """Predict mean and covariance after a time ``step`` (s), with Singer's motion model."""
     fade = np.exp(-step / FADES)
     speed = FADES * (1 - fade)
     ahead = np.tile(np.eye(3), (len(step), 1, 1))
@@ -238,7 +238,7 @@ def _predicted(bodies: _Followed, step: Floats) -> tuple[Floats, Floats]:
 
 
 def _faded(bodies: _Followed, moved: Floats, step: Floats, calm: float) -> tuple[Floats, Floats]:
-    """Return the weighted sums and moments after a time step, relative to the new position."""
+    """Reduce the weight of old positions after a time step. Return their sums relative to the new position."""
     s0, s1, s2 = bodies.sums.T
     m0, m1 = bodies.moments[:, 0], bodies.moments[:, 1]
     fade = np.exp(-step / calm)
@@ -250,7 +250,7 @@ def _faded(bodies: _Followed, moved: Floats, step: Floats, calm: float) -> tuple
 
 @dataclass(slots=True)
 class ClientNoise:
-    """Smoother for the frames of a client. The noise comes from the settings or from the first frames.
+    """Smoother for the frames of a client. It takes the noise from the settings or the first frames.
 
     Parameters
     ----------
@@ -264,7 +264,7 @@ class ClientNoise:
     _first: list[_Seen] | None = field(default_factory=list["_Seen"])
 
     def smoothed(self, block: FrameBlock, node: Ints) -> FrameBlock:
-        """Return a block of one frame with motion filled in, if the positions have noise."""
+        """If the positions have noise, return a block of one frame with motion filled in."""
         now = int(block.time_ns[0])
         before, self._time_ns = self._time_ns, now
         seconds = (now - before) / 1e9 if before is not None else np.nan
@@ -295,7 +295,7 @@ class ClientNoise:
 
 
 class _Seen(NamedTuple):
-    """Frame of a client: block, final node ids, and time since the previous frame; s."""
+    """Frame of a client: its block, final node ids, and the time since the frame before; s."""
 
     block: FrameBlock
     node: Ints
@@ -303,7 +303,7 @@ class _Seen(NamedTuple):
 
 
 def _noise_of(frames: list[_Seen]) -> Noise:
-    """Estimate the noise of the positions of frames."""
+    """Estimate the noise of the positions in some frames."""
     states = chained([one.block.states for one in frames])
     return noise_of(
         np.concatenate([one.node for one in frames]),

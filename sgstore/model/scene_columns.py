@@ -1,4 +1,4 @@
-"""Scene graphs of many frames as shared columns, converted to one graph object per frame."""
+"""Scene graphs of many frames as shared columns, and their conversion to one graph object per frame."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ MOST_RECORDS: Final = 1 << 16
 
 
 class MapRecords:
-    """Nodes and edges of a road map for scene graphs: node attributes and edge columns.
+    """Map nodes and edges in scene graphs: node attributes, and edges as columns.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class MapRecords:
         self._lowest = min(src.min(initial=0), dst.min(initial=0))
 
     def among(self, present: Ints) -> Ints:
-        """Return the row numbers of the map edges whose two nodes are both present."""
+        """Return the rows of the map edges whose two nodes are both in ``present``."""
         if not len(present):
             return np.zeros(0, np.intp)
         here = np.zeros(1 - min(present.min(), self._lowest), np.bool_)
@@ -80,7 +80,7 @@ class MapRecords:
 
 @dataclass(frozen=True, slots=True)
 class SceneColumns:
-    """Scene graphs of several frames of a trace, stored as shared columns.
+    """Scene graphs of several frames of a trace, stored together as columns.
 
     Attributes
     ----------
@@ -113,7 +113,7 @@ class SceneColumns:
     map: MapRecords | None
 
     def graphs(self) -> Iterator[SceneGraph]:
-        """Yield the scene graph of each frame, with moving, static and map nodes.
+        """Yield the scene graph of each frame, with moving nodes, static nodes and map nodes.
 
         Edges of the trace come before map edges.
         """
@@ -170,7 +170,7 @@ def edge_attributes(
     lanes: Iterable[tuple[int, int, int, Attributes]],
     gaps: Iterable[tuple[int, int, int, Attributes]],
 ) -> dict[tuple[int, int, int, int], Attributes]:
-    """Return the attributes of scene graph edges: (frame, relation, source, destination) → attributes.
+    """Return the attributes of each scene graph edge: (frame, relation, source, destination) → attributes.
 
     Parameters
     ----------

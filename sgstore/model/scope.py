@@ -1,4 +1,4 @@
-"""Sums over all traces of the data that the settings exclude from a query."""
+"""Counts of the data that the settings exclude from a query, summed over all traces."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 def scope_of(reports: Iterable[Mapping[str, Any]], *, world: bool | None) -> dict[str, Any]:
-    """Return counts of the object states that settings exclude from a query, or an empty dict.
+    """Return counts of object states that the settings exclude from a query; empty if nothing is excluded.
 
     Parameters
     ----------

@@ -34,7 +34,7 @@ _SLACK: Final = _SLACK_NS / 1e9
 
 @dataclass(frozen=True, slots=True)
 class TracePart:
-    """Selected part of a trace: a time span and a frame rate.
+    """Selected part of a trace: a time span and a frame rate to reduce it to.
 
     Attributes
     ----------
@@ -106,7 +106,7 @@ class _Clock:
         )
 
     def kept(self, time_ns: Ints) -> Bools:
-        """Return a mask of the frames to keep, by time span and frame rate."""
+        """Return a mask of the frames in the time span that fit the lower frame rate."""
         part = self._part
         self._zero = int(time_ns[0]) if self._zero is None else self._zero
         since = (time_ns - self._zero) / 1e9

@@ -64,7 +64,7 @@ COLUMNS: Final = tuple(field.name for field in fields(Note))
 
 
 class NotesFile:
-    """CSV file with the tags of users about the frames of a store.
+    """CSV file with the tags that users gave to frames of a store.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ class NotesFile:
         return found.st_size, found.st_mtime_ns
 
     def add(self, note: Note, last: int, *, gone: bool = False) -> None:
-        """Append a tag (or its removal) to the file, for each frame from that of ``note`` to ``last``.
+        """For each frame from that of ``note`` to ``last``, append the tag (or its removal) to the file.
 
         Raises
         ------
@@ -151,7 +151,7 @@ class NotesFile:
 
 
 def write_table(notes: list[Note], to: Path) -> None:
-    """Write tags of frames as a CSV table for queries: one row per frame, tags separated by commas."""
+    """Write tags of frames as a CSV table for queries: one row per frame, its tags separated by commas."""
     frames: dict[tuple[str, int], list[Note]] = {}
     for note in notes:
         frames.setdefault((note.trace, note.seq), []).append(note)

@@ -182,7 +182,7 @@ LIGHT_STATE_CODE: Final[Mapping[str, int]] = _light_state_code
 
 
 def normalize_name(name: str) -> str:
-    """Return a name in lower case without underscores, to compare names."""
+    """Return a name in lower case without underscores, for comparison with others."""
     return name.replace("_", "").lower()
 
 
@@ -234,7 +234,7 @@ _asked: Final[ContextVar[Mapping[str, Sequence[str]] | None]] = ContextVar("aske
 
 
 def learn(enum: str, name: str) -> int:
-    """Register a name (kind, relation or light state) read from a store, and return its code.
+    """Register a name (kind, relation or light state) that a store contains, and return its code.
 
     Parameters
     ----------
@@ -314,7 +314,7 @@ def _made(enum: str, name: str) -> int:
 
 
 def _refuse_like_own(enum: str, name: str) -> None:
-    """Raise an error for a new name that equals a built-in name except for case and underscores."""
+    """Raise an error if a new name equals a built-in name, apart from case and underscores."""
     folded, like = normalize_name(name), ""
     if enum == "light_state" and folded in _OWN_FOLDED[enum]:
         like = f"the state {_OWN_FOLDED[enum][folded]!r}"
@@ -328,7 +328,7 @@ def _refuse_like_own(enum: str, name: str) -> None:
 
 @contextmanager
 def asking(names: Mapping[str, Sequence[str]] | None) -> Generator[None]:
-    """Context manager that limits valid names to those of one store, built-in and registered names.
+    """Context manager: only built-in names and the names of one store are valid inside the block.
 
     Parameters
     ----------
@@ -349,7 +349,7 @@ def known_names(enum: str) -> tuple[str, ...]:
 
 
 def _others(enum: str) -> Sequence[str]:
-    """Return all valid names that are not built in; names of the queried store come first."""
+    """Return all valid names that are not built in. Those of the queried store come first."""
     asked = _asked.get()
     if asked is None:
         return NAMES[enum][len(_OWN[enum]) :]
@@ -358,7 +358,7 @@ def _others(enum: str) -> Sequence[str]:
 
 
 def _meant(enum: str, word: str) -> str | None:
-    """Return the known name for a word in a query: the same name, a built-in name, or a similar one."""
+    """Return the valid name for a word in a query, whatever its case and underscores; otherwise ``None``."""
     others, folded = _others(enum), normalize_name(word)
     if word in others:
         return word
@@ -393,7 +393,7 @@ def _add_plugins() -> None:
 
 
 def relation_named(name: str) -> str | None:
-    """Return the name of a relation for a word in a query, or ``None`` if unknown."""
+    """Return the name of a relation for a word in a query; ``None`` if unknown."""
     found = _meant("relation", name)
     if found is None:
         _add_plugins()  # the search takes time
@@ -402,7 +402,7 @@ def relation_named(name: str) -> str | None:
 
 
 def kinds_labelled(label: str) -> tuple[str, ...] | None:
-    """Return the kinds that a label (such as ``Vehicle``) covers, or ``None`` for an unknown label.
+    """Return the kinds that a label (such as ``Vehicle``) covers; ``None`` if the label is unknown.
 
     ``Ego`` is not a label of kinds.
     """
@@ -414,7 +414,7 @@ def kinds_labelled(label: str) -> tuple[str, ...] | None:
 
 
 def kind_named(word: str) -> str | None:
-    """Return the kind for a word or its synonym. ``None`` means an unknown or ambiguous word.
+    """Return the kind for a word or its synonym; ``None`` if the word is unknown or ambiguous.
 
     ``vehicle`` means the kind of that name here, although the label covers all vehicle kinds.
     """
@@ -426,7 +426,7 @@ def kind_named(word: str) -> str | None:
 
 
 def vague_kind(type_name: str) -> str:
-    """Return a kind for a simulator type name without a mapping: ``vehicle`` or ``unknown``.
+    """Return the kind of a type name that has no known meaning: ``vehicle`` or ``unknown``.
 
     OSI uses ``TYPE_VEHICLE``; names of CARLA and nuScenes begin with ``vehicle.``.
     """
@@ -442,7 +442,7 @@ def labels() -> tuple[str, ...]:
 
 
 def natural(name: str) -> tuple[tuple[tuple[int, str], ...], str]:
-    """Return a sort key for trace names in natural order (``run2`` before ``run10``).
+    """Return a sort key for trace names that puts ``run2`` before ``run10``.
 
     Digits compare as numbers, letters without case. The characters decide between names that are still equal.
     """
@@ -453,7 +453,7 @@ def natural(name: str) -> tuple[tuple[tuple[int, str], ...], str]:
 
 
 def suggestion(name: str, known: Iterable[str], alike: float = 0.6) -> str | None:
-    """Return the known name most similar to a given name, or ``None`` if none is similar.
+    """Return the known name most similar to a given name; ``None`` if no name is similar.
 
     ``None`` means no similarity of at least ``alike`` (0 to 1).
     """
@@ -469,7 +469,7 @@ def suggestion(name: str, known: Iterable[str], alike: float = 0.6) -> str | Non
 
 @dataclass(frozen=True, slots=True)
 class TypeMeaning:
-    """Meaning of a simulator's type name: kind, subkind and special role of the object.
+    """Meaning of a simulator's type name: kind, subkind and special role of an object.
 
     Attributes
     ----------
@@ -488,7 +488,7 @@ class TypeMeaning:
 
 @cache
 def type_meanings() -> Mapping[str, TypeMeaning]:
-    """Return the built-in mapping of simulator type names: type name in lower case → meaning."""
+    """Return the built-in meanings of simulator type names: type name in lower case → meaning."""
     text = resources.files("sgstore.model").joinpath("vocabulary.toml").read_text(encoding="utf-8")
     return {
         name.lower(): TypeMeaning(**meaning)

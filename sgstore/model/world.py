@@ -1,4 +1,4 @@
-"""Input data of scene graphs: object states of a trace as arrays, events, and message positions.
+"""Input data of scene graphs: object states of a trace as arrays, its events, and positions of messages.
 
 Readers pass these values to the scene graph generator and to the store. The store rounds them. Conventions of
 axes, units and signs are those of :mod:`sgstore.base.geometry`: OpenDRIVE's inertial axes, metres, radians,
@@ -83,7 +83,7 @@ def covered_s(start_ns: int, end_ns: int, frames: int, period_ns: int) -> float:
 
 
 def tolerance_ns(period_ns: int) -> int:
-    """Return the clock tolerance of a trace: times this close count as equal; ns.
+    """Return the clock tolerance of a trace: a time difference that still counts as equal; ns.
 
     All comparisons of time use this tolerance in favour of equality: ``>= 3 s`` is true for 2.9999 s, ``< 3 s``
     is false.
@@ -102,14 +102,14 @@ def tolerance_ns(period_ns: int) -> int:
 
 
 def own_column(values: Sequence[Mapping[str, Any] | None]) -> NDArray[np.object_]:
-    """Return the column :attr:`States.own` for attributes without a column, one mapping per row."""
+    """Return the column :attr:`States.own`: for each row, the attributes without a column of their own."""
     column = np.full(len(values), None, object)
     column[:] = values
     return column
 
 
 def valid_attributes(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the attributes that a store can hold: finite numbers, texts and truth values.
+    """Return only the attributes that a store can hold: finite numbers, texts and truth values.
 
     Names have 1 to :data:`LONGEST_NAME` characters, texts at most :data:`LONGEST_TEXT`.
     """
@@ -124,12 +124,12 @@ def valid_attributes(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def derivable_ns(period_ns: float) -> float:
-    """Return the longest gap between frames over which speeds are derived from positions; ns."""
+    """Return the longest time between two frames from which speeds are derived; ns."""
     return 3 * period_ns + tolerance_ns(int(period_ns))
 
 
 def longest_step_ns(period_ns: int) -> float:
-    """Return the longest time between consecutive frames without a missing frame; ns."""
+    """Return the longest step between two frames that does not count as a gap; ns."""
     return GAP * period_ns + tolerance_ns(period_ns)
 
 
@@ -196,7 +196,7 @@ def is_plausible(
 
 
 def without_implausible(values: Floats) -> tuple[Floats, list[tuple[int, str]]]:
-    """Return values with NaN in place of impossible sizes and velocities, and fault texts.
+    """Set impossible sizes and velocities to NaN. Return the values, and the faults as text.
 
     Parameters
     ----------
@@ -263,7 +263,7 @@ class FaultTally:
 
 
 def is_leap(away: float, seconds: float) -> bool:
-    """Return True if a distance is too long for an object to move in the given time.
+    """Return True if an object cannot move so far in the given time.
 
     Parameters
     ----------
@@ -276,7 +276,7 @@ def is_leap(away: float, seconds: float) -> bool:
 
 
 def leaps(away: Floats, seconds: Floats) -> Bools:
-    """Return a mask of distances that are too long for objects to move in the given times."""
+    """Return a mask: True if an object cannot move so far in the given time."""
     return (seconds > 0) & (away > FASTEST * seconds + LEAP)
 
 
@@ -313,7 +313,7 @@ class Sight(NamedTuple):
 
 
 class Life(NamedTuple, Generic[AnyEntity]):
-    """Object that shares its id with other objects over time, with its last position."""
+    """Object with an id that other objects also use at other times. Its last position is kept."""
 
     entity: AnyEntity
     kind: int
@@ -336,7 +336,7 @@ class Life(NamedTuple, Generic[AnyEntity]):
         return not is_leap(away, (here.time_ns - seen.time_ns) / 1e9)
 
     def is_recent(self, here: Sight) -> bool:
-        """Return True if the object disappeared only a short time ago, or before a clock jump."""
+        """Return True if the object was last seen a short time ago, or before a clock jump."""
         seen = self.seen
         if seen is None or seen.run != here.run:
             return True
@@ -344,7 +344,7 @@ class Life(NamedTuple, Generic[AnyEntity]):
 
 
 class Lives(Generic[AnyEntity]):
-    """Objects that have used the same id, one after another.
+    """Objects that have used the same id, at different times.
 
     If an id returns with another kind, or at an impossible distance, it denotes another entity from then on.
     Entities that use one id in turns continue.
@@ -373,7 +373,7 @@ class Lives(Generic[AnyEntity]):
     def follow(
         self, kind: int, here: Sight, enter: Callable[[], AnyEntity], *, sure_kind: bool = True
     ) -> AnyEntity:
-        """Return the object that an observation with a shared id belongs to. It may be a new object.
+        """Return the object to which an observation with a shared id belongs. It may be a new one.
 
         Parameters
         ----------
@@ -408,7 +408,7 @@ HIGHEST_GEAR: Final = 127
 
 @dataclass(frozen=True, slots=True)
 class Entities:
-    """Constant properties of the objects that are new in a block of frames, by node id.
+    """Constant properties of the objects that first occur in a block of frames, by node id.
 
     Attributes
     ----------
@@ -528,7 +528,7 @@ class States:
         return len(self.node)
 
     def take(self, rows: NDArray[np.intp] | Bools) -> States:
-        """Return selected rows of object states in the given order."""
+        """Return the given rows of object states, in the given order."""
         return taken(self, rows)
 
     @classmethod
@@ -638,7 +638,7 @@ class FrameBlock:
 
     @property
     def frame_of(self) -> Ints:
-        """Index of the frame of each object state in the block, (N,) int64."""
+        """For each object state, the index of its frame within the block, (N,) int64."""
         return np.repeat(np.arange(len(self)), np.diff(self.offsets))
 
 
@@ -752,7 +752,7 @@ _PIECE: Final = 4096
 
 
 def nearest_frames(events: Sequence[Event], time_ns: Any, log_time_ns: Any) -> Ints:
-    """Return the row of the nearest frame for each event. The first of two equally near frames is used."""
+    """Return the row of the nearest frame for each event. If two are equally near, the first one."""
     found: list[Ints] = [np.zeros(0, np.int64)]
     for start in range(0, len(events), _PIECE):
         some = events[start : start + _PIECE]
@@ -816,7 +816,7 @@ class Clip:
     end_ns: int
 
     def widened(self, by: int) -> Clip:
-        """Return the time interval, extended at both ends by a time; ns.
+        """Return the time interval, with a time (ns) added at both ends.
 
         Examples
         --------
@@ -849,7 +849,7 @@ class Origin:
 
 
 def origin_of(frames: FrameBlock) -> Origin | None:
-    """Return a coordinate origin for a trace: the median position in its first frame, in whole metres.
+    """Return a coordinate origin for a trace: the median position of its first frame, in whole metres.
 
     The result does not depend on the ego. Without moving entities, the scenery counts. ``None`` means no
     positions yet.
@@ -870,7 +870,7 @@ def _middle(states: States) -> Origin:
 
 
 def quantize(frames: FrameBlock, origin: Origin) -> FrameBlock:
-    """Round the object states of frames to the precision of the store.
+    """Round the object states of frames as a store does.
 
     Graphs are then equal before and after storage.
     """
@@ -882,7 +882,7 @@ def quantize(frames: FrameBlock, origin: Origin) -> FrameBlock:
 
 
 def _as_kept(states: States, origin: Origin) -> States:
-    """Convert object states to the form in the store: float32, relative to the coordinate origin.
+    """Convert object states to the form in a store: float32, relative to the coordinate origin.
 
     A second call, or storage, changes nothing.
 

@@ -62,7 +62,7 @@ def from_dict(values: Mapping[str, Any]) -> Config:
 
 
 def configured(**settings: Any) -> Config:
-    """Return the settings for keyword arguments. A table of settings is a mapping or an object.
+    """Return the settings for keyword arguments. Each table is given as a mapping or as an object.
 
     ::
 

@@ -141,7 +141,7 @@ class RangeSettings:
 
     @property
     def boundless(self) -> bool:
-        """True if the store has all objects of the recording, regardless of their distance from the ego."""
+        """True if the store has all objects of the recording, at any distance from the ego."""
         return self.world >= MOST_LENGTH
 
 
@@ -187,7 +187,7 @@ class LaneSettings:
 
 @dataclass(frozen=True, slots=True)
 class Proximity:
-    """Distance relations with their upper bounds. The first relation whose bound is not exceeded holds.
+    """Distance relations and their upper bounds. The first relation whose bound is not exceeded holds.
 
     Attributes
     ----------
@@ -216,7 +216,7 @@ class Proximity:
 
 @dataclass(frozen=True, slots=True)
 class Direction:
-    """Angular relations between entities, such as ``inFrontOf``.
+    """Direction relations between entities, such as ``inFrontOf``.
 
     The first one with an upper bound at or above the absolute bearing holds; else the last.
 
@@ -258,7 +258,7 @@ class Direction:
 
 @dataclass(frozen=True, slots=True)
 class PairSettings:
-    """Settings of the pairs of entities that can have relations.
+    """Settings that define which pairs of entities can have relations.
 
     Attributes
     ----------
@@ -290,7 +290,7 @@ class PairSettings:
 
 @dataclass(frozen=True, slots=True)
 class Payloads:
-    """Settings of the join of sensor messages to frames.
+    """Settings that define which sensor messages belong to a frame.
 
     Attributes
     ----------
@@ -312,7 +312,7 @@ class Payloads:
 
 @dataclass(frozen=True, slots=True)
 class Signs:
-    """Settings for reading the signals of a road map.
+    """Settings for reading the signals (signs and lights) of a road map.
 
     Attributes
     ----------
@@ -442,7 +442,7 @@ class Config:
 
     @property
     def signs(self) -> Signs:
-        """Settings for reading the signals of a road map with :func:`sgstore.maps.opendrive.read_map`.
+        """Settings for :func:`sgstore.maps.opendrive.read_map`: how to read the signals of a road map.
 
         Examples
         --------
@@ -455,7 +455,7 @@ class Config:
 
     @property
     def notes(self) -> list[str]:
-        """Return hints about user-defined relation names that are similar to a built-in name, maybe by mistake.
+        """Return a hint for each new relation name that is similar to a built-in name, perhaps by mistake.
 
         Examples
         --------
@@ -471,7 +471,7 @@ class Config:
         ]
 
     def unknown_of(self, types: Mapping[str, int]) -> dict[str, int]:
-        """Return the counts of the type names for which the settings define no kind.
+        """Return how often each type name occurs for which the settings define no kind.
 
         Examples
         --------
@@ -483,7 +483,7 @@ class Config:
         return {name: n for name, n in types.items() if name.lower() not in self.types}
 
     def as_stored(self) -> dict[str, Any]:
-        """Return the settings as a store keeps them. Settings that older stores lack are omitted by default.
+        """Return the settings as a store keeps them. Settings added later are left out at their default.
 
         Examples
         --------
@@ -498,7 +498,7 @@ class Config:
         return found
 
     def __repr__(self) -> str:
-        """Return the settings that differ from the defaults: ``Config(range.radius=30.0)``."""
+        """Return as text the settings that differ from the defaults: ``Config(range.radius=30.0)``."""
         told = list[str]()
         for name, default in Config().as_dict().items():
             value = self.as_dict()[name]
@@ -555,14 +555,14 @@ def check_labels(name: str, given: Iterable[str], *, ego: bool) -> None:
 
 
 def check_pairs(name: str, pairs: tuple[tuple[str, ...], ...]) -> None:
-    """Raise an error unless a setting is a list of pairs of valid labels."""
+    """Raise an error if a setting is not a list of pairs of valid labels."""
     for i, pair in enumerate(pairs):
         check(len(pair) == 2, f"{name}[{i}]", pair, "two labels")
         check_labels(f"{name}[{i}]", pair, ego=True)
 
 
 def check_polygon(name: str, corners: tuple[tuple[float, ...], ...]) -> None:
-    """Raise an error if corners do not form a simple polygon."""
+    """Raise an error if corner points do not form a simple polygon."""
     pairs = all(len(corner) == 2 and all(map(math.isfinite, corner)) for corner in corners)
     right = f"3 to {MOST_CORNERS} corners [ahead, to the left], in metres"
     check(pairs and 3 <= len(corners) <= MOST_CORNERS, name, corners, right)

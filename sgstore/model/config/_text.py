@@ -74,7 +74,7 @@ def _meaning(parts: dict[str, str]) -> str:
 
 
 def as_markdown(presets: Mapping[str, Preset]) -> str:
-    """Return the page ``docs/parameters.md``: all settings with their defaults, and the presets."""
+    """Return the text of ``docs/parameters.md``: all settings with their defaults, and the presets."""
     parts = [_preset_text(name, one) for name, one in presets.items()]
     page = resources.files("sgstore.model.config").joinpath("parameters.md")
     text = page.read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Conversion of plain values to tables of settings, with errors for unknown names and wrong types."""
+"""Conversion of plain values to tables of settings. Unknown names and wrong types raise errors."""
 
 from __future__ import annotations
 

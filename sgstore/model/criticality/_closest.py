@@ -1,4 +1,4 @@
-"""Smallest distance and first contact of two objects in the recording, seen from each frame.
+"""Smallest distance and first contact of two objects in the recording, from each frame on.
 
 dce_recorded(t) (m) = min { gap(t′) : t′ ≥ t }, ttce_recorded(t) (s) = the first such t′ minus t.
 Source: Eggert, Predictive Risk Estimation for Intelligent ADAS Functions, 2014.
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 
 def dce_recorded(of: Encounter) -> Floats:
-    """Return the smallest gap between two objects from each frame on, (T,); m. NaN if unknown."""
+    """Return the smallest gap between two objects from each frame to the end, (T,); m. NaN if unknown."""
     gap = of.numbers["gap"]
     least = np.minimum.accumulate(np.where(np.isnan(gap), np.inf, gap)[::-1])[::-1]
     return np.where(np.isfinite(least), least, np.nan)
 
 
 def ttce_recorded(of: Encounter) -> Floats:
-    """Return the time until two objects have their smallest gap, from each frame on, (T,); s."""
+    """Return the time from each frame until two objects have their smallest gap, (T,); s."""
     gap, times, least = of.numbers["gap"], of.times, dce_recorded(of)
     found = np.full(len(times), np.nan)
     when = np.nan
@@ -38,7 +38,7 @@ def ttce_recorded(of: Encounter) -> Floats:
 
 
 def ttc_recorded(of: Encounter) -> Floats:
-    """Return the time until two objects touch in the recording, for each frame, (T,); s. NaN for never."""
+    """Return the time from each frame until two objects touch in the recording, (T,); s. NaN for never."""
     times = of.times
     met = np.where(of.numbers["gap"] <= 0, times, np.inf)
     first = np.minimum.accumulate(met[::-1])[::-1]

@@ -1,4 +1,4 @@
-"""Tracks (recorded states) of two objects, and the times when they cover the same position."""
+"""Tracks (recorded states) of two objects, and the frames in which they cover the same area."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _TOGETHER: Final = 256
 
 @dataclass(frozen=True)
 class Track:
-    """Track of an object in a trace: position, heading, size and motion in each of its frames.
+    """Track of an object in a trace: its position, heading, size and motion in each frame.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class Track:
 
     @cached_property
     def circles(self) -> tuple[Floats, Floats, Floats]:
-        """Bounding circles of the footprints, one per group of consecutive frames: x, y and radius."""
+        """Bounding circle of the footprints in each group of consecutive frames: x, y and radius."""
         count = -(-len(self) // _BLOCK)
         rows = np.minimum(np.arange(count * _BLOCK), len(self) - 1).reshape(count, _BLOCK)
         x, y = self.states[rows, 0], self.states[rows, 1]
@@ -56,7 +56,7 @@ class Track:
 
 @dataclass(frozen=True)
 class Encounter:
-    """Tracks of two objects a and b of one trace. The criticality measures apply to a.
+    """Tracks of two objects a and b of one trace. Criticality measures describe the risk of a.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class Encounter:
 
     @cached_property
     def numbers(self) -> PairNumbers:
-        """Measures of the object pair (gap, closing speed, …) in the frames that have both objects."""
+        """Measures of the two objects (gap, closing speed, …) in each frame that has both."""
         rows_a, rows_b = self.together
         return PairNumbers(self.a.states[rows_a], self.b.states[rows_b])
 
@@ -92,7 +92,7 @@ class Encounter:
         return not any(np.isnan(one.states[:, [0, 1, 3, 4, 5]]).any() for one in (self.a, self.b))
 
     def crossings(self) -> Iterator[tuple[Ints, Ints]]:
-        """Yield rows of a and of b in which both objects cover a common area at different times."""
+        """Yield frame rows of a and of b in which both cover a common area, also at different times."""
         if not self.known:
             return
         (x1, y1, r1), (x2, y2, r2) = self.a.circles, self.b.circles
@@ -106,7 +106,7 @@ class Encounter:
                 yield self._touching(first + blocks_a[part], blocks_b[part])
 
     def _touching(self, blocks_a: Ints, blocks_b: Ints) -> tuple[Ints, Ints]:
-        """Return rows of a and of b, among pairs of blocks, in which the footprints touch or overlap."""
+        """Return the frame rows of a and b, within pairs of frame groups, whose footprints touch or overlap."""
         inner = np.arange(_BLOCK)
         rows_a = (blocks_a[:, None] * _BLOCK + inner)[:, :, None]
         rows_b = (blocks_b[:, None] * _BLOCK + inner)[:, None, :]

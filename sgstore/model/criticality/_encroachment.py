@@ -1,4 +1,4 @@
-"""Encroachment: times at which two objects are in their conflict area (area that both cross).
+"""Encroachment: times at which two objects enter and leave their conflict area (area that both cross).
 
 The conflict area of two tracks is the area that both footprints cover, at any time. An entity is in
 it while its footprint overlaps any footprint of the other entity, at any time. It enters with the
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Encroachment:
-    """Entry and exit times of two objects in their conflict area; s. NaN means unknown, or no such area.
+    """Times at which two objects enter and leave their conflict area; s. NaN if unknown or no such area.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class Encroachment:
 
 
 def encroachment(of: Encounter) -> Encroachment:
-    """Return entry and exit times of two objects in their conflict area (area that both cross).
+    """Return when two objects enter and leave their conflict area (area that both cross); s.
 
     An entry is unknown if the first frame is in the area, and an exit if the last frame is.
     """
@@ -49,7 +49,7 @@ def encroachment(of: Encounter) -> Encroachment:
 
 
 def _when(of: Encounter) -> Floats:
-    """Return entry and exit times of two objects in their conflict area, (1, 4); s."""
+    """Return when two objects enter and leave their conflict area as an array, (1, 4); s."""
     objects = np.repeat([0, 1], [len(of.a), len(of.b)])
     states = np.concatenate([of.a.states, of.b.states])
     footprints = Footprints(objects, states[:, FOOTPRINT].T)
@@ -83,5 +83,5 @@ def pet(of: Encounter) -> float:
 
 
 def et_recorded(of: Encounter) -> float:
-    """Return the encroachment time: how long object a is in the conflict area; s. NaN if unknown."""
+    """Return the encroachment time: how long object a stays in the conflict area; s. NaN if unknown."""
     return float(_et(_when(of))[0])

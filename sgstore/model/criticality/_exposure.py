@@ -1,4 +1,4 @@
-"""Exposure measures: total time of an encounter with a short time to collision (TET, TIT).
+"""Exposure measures (TET, TIT): for how long the time to collision of an encounter is short.
 
 TET (s) = Σ Δt over frames with ttc ≤ τ, TIT (s²) = Σ (τ − ttc) Δt over the same frames; Δt is the
 time to the next frame. Source: Minderhoud and Bovy, Extended Time-to-Collision Measures for Road
@@ -19,12 +19,12 @@ TAU: Final = 2.0
 
 
 def tet(of: Encounter, tau: float = TAU) -> float:
-    """Return the time exposed time to collision (TET): total time with TTC of at most ``tau``; s."""
+    """Return the time exposed time to collision (TET): total time with a TTC of at most ``tau``; s."""
     return _summed(of, tau, 0)
 
 
 def tit(of: Encounter, tau: float = TAU) -> float:
-    """Return the time integrated time to collision (TIT): integral of ``tau`` - TTC where positive; s²."""
+    """Return the time integrated time to collision (TIT): integral of ``tau - TTC`` where TTC < ``tau``; s²."""
     return _summed(of, tau, 1)
 
 

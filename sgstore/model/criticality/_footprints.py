@@ -1,4 +1,4 @@
-"""Footprints of many objects over time, and the frames in which pairs of them cover a common area.
+"""Footprints of many objects over time, and the frames in which two objects cover a common area.
 
 Notes
 -----
@@ -33,7 +33,7 @@ _MARGIN: Final = 1e-6
 
 @dataclass(frozen=True)
 class _Level:
-    """Bounding boxes on one level of a tree: their sides, first rows, and first boxes of the level below."""
+    """Level of a tree of bounding boxes: the sides of each box, its first row, and its first child box."""
 
     sides: Floats
     rows: Ints
@@ -41,7 +41,7 @@ class _Level:
 
 
 class Footprints:
-    """Footprints of objects. A row is a frame in which the footprint differs from that in the frame before.
+    """Footprints of objects. A row is a frame in which an object's footprint has changed.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ class Footprints:
 
     @cached_property
     def directions(self) -> tuple[Floats, Floats]:
-        """Cosine and sine of each heading, (R,)."""
+        """Cosine and sine of the heading of each footprint, (R,)."""
         return np.cos(self.boxes[2]), np.sin(self.boxes[2])
 
     @cached_property
@@ -112,7 +112,7 @@ class Footprints:
         return levels
 
     def crossed(self, a: Ints, b: Ints) -> Ints:
-        """Return the states in which pairs of objects enter and leave their common area, (P, 4).
+        """Return the state rows in which two objects enter and leave their common area, for many pairs, (P, 4).
 
         Parameters
         ----------
@@ -139,7 +139,7 @@ class Footprints:
 
 
 class AreaSearch:
-    """Search for the first and last footprints of two objects in their common area, for many pairs.
+    """Search for many pairs of objects: the first and last footprints of both in their common area.
 
     Attributes
     ----------
@@ -154,7 +154,7 @@ class AreaSearch:
         self.last = np.full((2, pairs), -1)
 
     def run(self, pair: Ints, a: Ints, b: Ints) -> None:
-        """Search pairs of objects, from large bounding boxes to small ones."""
+        """Compare pairs of objects: first their largest bounding boxes, then smaller and smaller ones."""
         waiting = [(len(self._of.levels) - 1, pair, a, b)]
         while waiting:
             level, pair, a, b = waiting.pop()
@@ -171,7 +171,7 @@ class AreaSearch:
                 waiting.append((level - 1, *_divided(below, pair, a, b)))
 
     def _near(self, level: int, pair: Ints, a: Ints, b: Ints) -> tuple[Ints, Ints, Ints]:
-        """Return the pairs of bounding boxes that overlap and may contain a new first or last row."""
+        """Return overlapping pairs of boxes in which the objects may meet earlier or later than known."""
         boxes = self._of.levels[level]
         on = self._boxes_overlap(level, a, b)
         pair, a, b = pair[on], a[on], b[on]
@@ -189,7 +189,7 @@ class AreaSearch:
         return on
 
     def _rows(self, pair: Ints, a: Ints, b: Ints) -> None:
-        """Compare the footprints of pairs of rows, and update the first and last rows."""
+        """Compare the footprints of pairs of rows. Update the first and last row found for each object pair."""
         sure = self._apart(a, b) < self._sure(a, b)
         self._found(pair[sure], a[sure], b[sure])
         near = np.flatnonzero(~sure & self._circles_overlap(a, b))
@@ -217,17 +217,17 @@ class AreaSearch:
         return found
 
     def _apart(self, a: Ints, b: Ints) -> Floats:
-        """Return squared distances of the centres of footprints; m²."""
+        """Return the squared distance between the centres of two footprints, for pairs of rows; m²."""
         x, y = self._of.boxes[0], self._of.boxes[1]
         away_x, away_y = x[a] - x[b], y[a] - y[b]
         return away_x * away_x + away_y * away_y
 
     def _sure(self, a: Ints, b: Ints) -> Floats:
-        """Return squared distances below which the inner circles of two footprints overlap; m²."""
+        """Return the squared distance below which two footprints surely overlap, for pairs of rows; m²."""
         return ((self._inner[a] + self._inner[b]) * (1 - 1e-9)) ** 2
 
     def _new(self, pair: Ints, first: tuple[Ints, Ints], last: tuple[Ints, Ints]) -> Bools:
-        """Return a mask of the ranges that may contain a new first or last row of their pair."""
+        """Return a mask of row ranges that may contain an earlier first or a later last row of their pair."""
         new = np.zeros(len(pair), np.bool_)
         for one in (0, 1):
             new |= (first[one] < self.first[one, pair]) | (last[one] > self.last[one, pair])
@@ -240,7 +240,7 @@ class AreaSearch:
 
 
 def _divided(below: Ints, pair: Ints, a: Ints, b: Ints) -> tuple[Ints, Ints, Ints]:
-    """Return the pairs of all parts of two bounding boxes, for many pairs of boxes."""
+    """For each pair of bounding boxes, return all pairs of their child boxes."""
     count_a, count_b = below[a + 1] - below[a], below[b + 1] - below[b]
     count = count_a * count_b
     of = np.repeat(np.arange(len(pair)), count)

@@ -31,7 +31,7 @@ def headway_recorded(of: Encounter) -> Floats:
 
 
 class HeadwaySearch(AreaSearch):
-    """Search for the least recorded headway of pairs of objects.
+    """Search for many pairs of objects: the smallest recorded headway of each pair.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class HeadwaySearch(AreaSearch):
         self._last_both = np.maximum.accumulate(np.where(both, np.arange(len(when)), -1))
 
     def _near(self, level: int, pair: Ints, a: Ints, b: Ints) -> tuple[Ints, Ints, Ints]:
-        """Return the pairs of bounding boxes that overlap, and may have a smaller headway: the least first."""
+        """Return pairs of overlapping bounding boxes that may have a smaller headway, most promising first."""
         on = self._boxes_overlap(level, a, b)
         pair, a, b = pair[on], a[on], b[on]
         rows = self._of.levels[level].rows
@@ -76,7 +76,7 @@ class HeadwaySearch(AreaSearch):
         return pair[on], a[on], b[on]
 
     def _rows(self, pair: Ints, a: Ints, b: Ints) -> None:
-        """Compare the footprints of pairs of rows, and update the smallest headways."""
+        """Compare the footprints of pairs of rows. Update the smallest headway of each object pair."""
         near = np.flatnonzero(self._circles_overlap(a, b))
         headway = self._headways(a[near], b[near])
         less = headway < self.least[pair[near]]
@@ -85,7 +85,7 @@ class HeadwaySearch(AreaSearch):
         np.minimum.at(self.least, pair[near[on]], headway[on])
 
     def _headways(self, a: Ints, b: Ints) -> Floats:
-        """Return the time from b's last frame at its position until a is there; s. Infinite if never."""
+        """Return the time from b's last frame at a position until a is there; s. Infinite if never."""
         key = self._object[b] * len(self._times) + self._end[a]
         last = np.minimum(self._keys.searchsorted(key, "right") - 1, self._ends[b])
         last = np.where(last >= 0, self._last_both[last], -1)

@@ -1,4 +1,4 @@
-"""Criticality measures of many object pairs at once; the values are those of each :class:`Encounter`.
+"""Criticality measures of many object pairs at once. The values are the same as in :class:`Encounter`.
 
 Notes
 -----
@@ -36,7 +36,7 @@ _DENSE: Final = 1 << 16
 
 
 def _numbered(ids: Ints) -> tuple[Ints, Ints]:
-    """Return the ids in ascending order (possibly with further ones), and the index of each given id."""
+    """Return ascending ids, which include all given ones, and the index of each given id in them."""
     low = int(ids.min())
     if int(ids.max()) - low < _DENSE:
         return np.arange(low, int(ids.max()) + 1), ids - low
@@ -44,7 +44,7 @@ def _numbered(ids: Ints) -> tuple[Ints, Ints]:
 
 
 class Meetings:
-    """Frames that contain both objects of a pair: pairs of one object of each trace with all other objects.
+    """All frames that contain both objects of a pair. One object per trace is paired with all others.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ class Meetings:
         return len(self.nodes)
 
     def least(self, rows: Ints, values: Floats) -> Floats:
-        """Return the least of the given values for each pair, (P,). Infinite for a pair without values."""
+        """Return the smallest of the given values for each pair, (P,). Infinite for a pair without values."""
         found = np.full(len(self), np.inf)
         np.minimum.at(found, self.pair[rows], values)
         return found
@@ -131,7 +131,7 @@ class Meetings:
 
     @cached_property
     def known(self) -> Bools:
-        """Mask of the rows with known positions and sizes of both objects, (R,)."""
+        """Mask of the rows in which positions and sizes of both objects are known, (R,)."""
         known: Bools = np.logical_and.reduce(~np.isnan(self._states[:, FOOTPRINT]), axis=1)
         return known[self.a] & known[self.b]
 
@@ -143,12 +143,12 @@ class Meetings:
 
     @cached_property
     def beyond(self) -> Floats:
-        """Distance between the circles around both footprints in each row, (R,); m. Negative for an overlap."""
+        """Distance between the circles around both footprints in each row, (R,); m. Negative for overlap."""
         reach = np.hypot(self._states[:, 4], self._states[:, 5]) / 2
         return self.away - reach[self.a] - reach[self.b]
 
     def numbers(self, rows: Ints, of: Callable[[PairNumbers], Floats]) -> Floats:
-        """Return the values of a measure for the objects in the given rows, (K,)."""
+        """Return a measure of the two objects in each given row, (K,)."""
         found = np.empty(len(rows))
         for start in range(0, len(rows), _TOGETHER):
             part = rows[start : start + _TOGETHER]
@@ -157,14 +157,14 @@ class Meetings:
         return found
 
     def ordered(self, pairs: Bools) -> tuple[Ints, Ints]:
-        """Return the rows of the selected pairs, by pair and time, and the index of each pair's first row."""
+        """Return the rows of some pairs, by pair and time, and the index of each pair's first row."""
         rows = np.flatnonzero(pairs[self.pair])
         rows = rows[np.lexsort((self.when[rows], self.pair[rows]))]
         return rows, np.flatnonzero(np.diff(self.pair[rows], prepend=-1))
 
     @cached_property
     def ahead(self) -> Ints:
-        """Return a superset of the rows in which object b is ahead in the path of object a."""
+        """Return the rows in which object b may be ahead in the path of object a: all such rows, and more."""
         x, y, _, heading, length, width, *_ = self._states.T
         cosine, sine = np.cos(heading), np.sin(heading)
         dx, dy = x[self.b] - x[self.a], y[self.b] - y[self.a]
@@ -175,7 +175,7 @@ class Meetings:
 
     @cached_property
     def closest(self) -> tuple[Floats, Floats]:
-        """Smallest gap of each pair (m), and time of its first row with this gap (s), (P,)."""
+        """Smallest gap of each pair (m), and the first time with this gap (s), (P,)."""
         inner = np.minimum(self._states[:, 4], self._states[:, 5]) / 2
         known = np.flatnonzero(self.known)
         most = (self.away - inner[self.a] - inner[self.b])[known]
@@ -188,7 +188,7 @@ class Meetings:
 
     @cached_property
     def exposed(self) -> tuple[Ints, Ints, Floats, Floats]:
-        """Rows of pairs with a short time to collision, first row of each pair, ttc and time step (s)."""
+        """Rows of pairs with a short TTC, first row of each pair, TTC (s), and time step (s)."""
         vx, vy = self._states[:, 6], self._states[:, 7]
         speed = np.hypot(vx[self.b] - vx[self.a], vy[self.b] - vy[self.a])
         near = np.flatnonzero(self.known & (self.beyond - TAU * speed <= _MARGIN))
@@ -205,7 +205,7 @@ class Meetings:
 
     @cached_property
     def _near(self) -> tuple[Ints, Ints]:
-        """Pairs whose regions overlap, and the states of their objects by object and time."""
+        """Pairs of objects whose areas of movement overlap, and the state rows of these objects."""
         others, sources = self._objects
         code, when, place, _ = self._tracks
         reach = np.hypot(self._states[:, 4], self._states[:, 5]) / 2 + _MARGIN
@@ -223,7 +223,7 @@ class Meetings:
 
     @cached_property
     def _footprints(self) -> tuple[Footprints, Ints, Ints]:
-        """Footprints of the objects of near pairs, and the two objects of each of these pairs."""
+        """Footprints of objects whose areas of movement overlap, and the two objects of each pair."""
         pairs, rows = self._near
         code, _, place, _ = self._tracks
         boxes = [self._states[:, column][place[rows]] for column in FOOTPRINT]
@@ -254,7 +254,7 @@ class Meetings:
         return found
 
     def values(self, name: str) -> Floats:
-        """Return a recorded criticality measure of each pair, (P,); NaN means unknown or undefined."""
+        """Return the named criticality measure of each pair, (P,). NaN if unknown or undefined."""
         with np.errstate(invalid="ignore"):
             if name in OF_AREAS:
                 return OF_AREAS[name](self.encroachments)

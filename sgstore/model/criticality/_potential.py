@@ -25,12 +25,12 @@ _MOST: Final = 12.68
 
 
 def _below(deceleration: float) -> float:
-    """Return the probability that the braking limit of a vehicle is below a deceleration (m/s²)."""
+    """Return the probability that the greatest possible braking of a vehicle is below a value in m/s²."""
     return (1 + math.erf((deceleration - _MEAN) / _DEVIATION / math.sqrt(2))) / 2
 
 
 def crash_probability(deceleration: Floats) -> Floats:
-    """Return the probability that a vehicle cannot reach a deceleration (m/s²), (n,); NaN for NaN."""
+    """Return the probability that a vehicle cannot brake at a needed deceleration (m/s²), (n,). NaN for NaN."""
     low, high = _below(_LEAST), _below(_MOST)
     found = np.where(deceleration >= _MOST, 1.0, 0.0)
     for row in np.flatnonzero((deceleration > _LEAST) & (deceleration < _MOST)).tolist():
@@ -39,7 +39,7 @@ def crash_probability(deceleration: Floats) -> Floats:
 
 
 def cpi(of: Encounter) -> float:
-    """Return the crash potential index of an encounter of two objects, 0 … 1.
+    """Return the crash potential index of an encounter of two objects, from 0 to 1.
 
     Frames without b ahead in a's path count as 0, frames with contact and without separation as 1;
     frames with an unknown required deceleration do not count. NaN if no frame counts.
@@ -49,7 +49,7 @@ def cpi(of: Encounter) -> float:
 
 
 def crash_chances(numbers: PairNumbers) -> Floats:
-    """Return the probability for each frame that braking is not enough, (K,). Unknown frames are left out."""
+    """Return the probability that braking is not enough, (K,), for each frame with known values."""
     needed = -numbers["a_long_req"]
     placed = ~np.isnan(numbers["lon"] + numbers["reach1"] + numbers["reach2"])
     lost = (numbers["lead"] == 0) & (numbers["closing"] > 0)

@@ -1,4 +1,4 @@
-"""Recorded criticality measures by name, and their values for the ego and all other objects of a store."""
+"""Recorded criticality measures by name. Their values for the ego and each other object in a store."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _STATES: Final = (
 
 @dataclass(frozen=True, slots=True)
 class RecordedMeasure:
-    """Criticality measure of two objects over a whole recording, with description and unit.
+    """Criticality measure of two objects over a whole recording. It has a description and a unit.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class RecordedMeasure:
         return f"{self.doc}; {self.unit}; of what was recorded: the same in each frame of a trace"
 
     def value(self, encounter: Encounter) -> float:
-        """Return the criticality measure for the tracks of two objects; NaN means unknown or undefined."""
+        """Return the criticality measure for the tracks of two objects; NaN if unknown or undefined."""
         of = getattr(import_module("sgstore.model.criticality"), self.name)
         found = np.atleast_1d(of(encounter))
         if self.least:
@@ -118,7 +118,7 @@ KNOWN: Final = "known "
 
 
 def tracks_of(found: Mapping[str, Any]) -> list[tuple[int, str, bool, Track]]:
-    """Convert table columns to the tracks of objects: node id, kind, True for an ego, track.
+    """Convert table columns to the tracks of objects, each with node id, kind, and True for an ego.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ def tracks_of(found: Mapping[str, Any]) -> list[tuple[int, str, bool, Track]]:
 
 
 class _Asked(Protocol):
-    """Interface of a store file: the methods that the recorded measures use."""
+    """Interface of a store file, reduced to the methods that the recorded measures use."""
 
     def arrays(self, sql: str, parameters: Sequence[object] | None = None) -> Mapping[str, Any]: ...
     def recorded_encounters(self, measures: Sequence[str]) -> Any: ...

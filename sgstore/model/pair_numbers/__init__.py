@@ -1,4 +1,4 @@
-"""Measures of object pairs (gap, bearing, time to collision, …), for SQL views, queries and arrays.
+"""Measures of object pairs (gap, bearing, time to collision, …) for SQL views, queries and arrays.
 
 A number is an expression of SQL over other numbers of the same pair, and finally over the columns
 of both entities (``a_x``: x of a; conventions of axes and units in :mod:`sgstore.base.geometry`). The

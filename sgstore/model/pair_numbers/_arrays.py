@@ -1,4 +1,4 @@
-"""Measures of object pairs on arrays: numpy evaluates the SQL expressions of the measures."""
+"""Measures of object pairs on arrays. numpy evaluates their SQL expressions."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ COLUMNS: Final = ("x", "y", "z", "heading", "length", "width", "vx", "vy", "ax",
 
 
 class PairNumbers(dict[str, "Floats"]):
-    """Measures of K object pairs (a, b) by name, each computed on first use; (K,) float64.
+    """Measures of K object pairs (a, b) by name, (K,) float64. Each is computed on first use.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ class PairNumbers(dict[str, "Floats"]):
 
     @classmethod
     def of(cls, a: Mapping[str, Floats], b: Mapping[str, Floats]) -> PairNumbers:
-        """Return the measures of pairs, from columns of the two entities by name."""
+        """Return the measures of object pairs. The columns of both objects are given by name."""
         found = cls.__new__(cls)
         for one, columns in (("a", a), ("b", b)):
             found.update({f"{one}_{name}": values for name, values in columns.items()})
@@ -107,7 +107,7 @@ _AS_PYTHON: Final = tuple(
 
 
 def _case(*parts: Any) -> Any:
-    """Evaluate an SQL ``CASE`` on arrays: the first value whose condition is true, else the last, or NaN."""
+    """Evaluate an SQL ``CASE`` on arrays: first value with a true condition, else the last value, or NaN."""
     pairs, found = len(parts) // 2, parts[-1] if len(parts) % 2 else np.nan
     for i in reversed(range(pairs)):
         found = np.where(parts[2 * i], parts[2 * i + 1], found)
@@ -132,7 +132,7 @@ def _is_known(value: Any, _: Any) -> Any:
 
 @cache
 def _functions() -> Mapping[str, Callable[..., Any]]:
-    """Return numpy functions for the SQL functions in expressions, by name."""
+    """Return the numpy functions that replace SQL functions in expressions, by name."""
     return {
         "case": _case,
         **{

@@ -1,4 +1,4 @@
-"""Measure of object pairs: gap between two footprints, or depth of their overlap."""
+"""Measure of object pairs: gap between two footprints, or how deep they overlap."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ _HALVES: Final = ((1, "la", 1, 2), (2, "wa", 2, 1), (3, "lb", 3, 4), (4, "wb", 4
 
 
 def _after_3s(text: str) -> str:
-    """Replace the position of object b in an SQL expression by its position after 3 s."""
+    """In an SQL expression, replace the position of object b by its position 3 s later."""
     return _MOVED.sub(r"\1_3s", text)
 
 

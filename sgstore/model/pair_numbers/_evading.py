@@ -1,4 +1,4 @@
-"""Measures of object pairs: remaining time or distance to evade by acceleration or braking."""
+"""Measures of object pairs: time or distance that remains to evade by acceleration or braking."""
 
 from __future__ import annotations
 

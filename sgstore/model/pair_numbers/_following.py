@@ -1,4 +1,4 @@
-"""Measures of object pairs that follow each other: headways, and needed accelerations."""
+"""Measures of object pairs on the same path: headways, and needed accelerations."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ OF_ONE: Final = (*NEXT_PARTS, *COURSES)
 
 
 def as_written(name: str, a: str, b: str) -> str:
-    """Return the query text of a measure of two objects, such as ``ttc(a, b)``."""
+    """Return the query text of a measure of two objects a and b, such as ``ttc(a, b)``."""
     if name in OF_ONE:
         return f"{name}({a})"
     return f"{LANE_DIST if name == PART_DIST else name}({a}, {b})"

@@ -1,4 +1,4 @@
-"""Heights of the lower and upper side of objects. They distinguish storeys (bridges) and flat objects.
+"""Heights of the lower and upper side of objects, to separate storeys (bridges) and find flat objects.
 
 Signals hang over the road and belong to no storey: they have no such heights. An upright kind never
 has height 0: there 0 means an unrecorded height, as in recordings without heights.
@@ -57,7 +57,7 @@ UNEVEN: Final = {"flat": 1, "storeys": 2, "carried": 4, "near_flat": 8, "near_st
 
 
 def all_level(low: Floats, high: Floats, frame: NDArray[np.int64] | None = None) -> bool:
-    """Return True if all compared objects are on the same storey (for example no bridge between them).
+    """Return True if all compared objects are on the same storey (no bridge between them).
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def all_level(low: Floats, high: Floats, frame: NDArray[np.int64] | None = None)
 
 
 def climb(distance: Floats, pitch_a: Floats, pitch_b: Floats) -> Floats:
-    """Return the possible height difference of a road between two objects, from their pitch; m.
+    """Return by how much a road can rise between two objects, from their distance and pitch; m.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Declaration of a measure of an object pair: name, unit, description and SQL expression."""
+"""Declaration of a measure of an object pair: its name, unit, description and SQL expression."""
 
 from __future__ import annotations
 
@@ -53,5 +53,5 @@ class PairFunction:
 def measure(
     doc: str, unit: str, sql: str, note: str, source: str, alias: str = "", worse: str = "low"
 ) -> PairFunction:
-    """Declare a criticality measure of two objects, such as time to collision."""
+    """Declare a measure of two objects, such as time to collision."""
     return PairFunction(doc, unit, sql, note, source, "criticality", alias=alias, worse=worse)

@@ -28,7 +28,7 @@ _WRITTEN_OUT: Final = 2000
 
 @cache
 def _spelled(name: str) -> int:
-    """Return the number of columns in the fully expanded SQL expression of a measure."""
+    """Return how many columns the SQL expression of a measure contains if all its inputs are expanded."""
     if name not in EXPRESSIONS:
         return 1
     return sum(1 if _is_apart(part) else _spelled(part) for part in NAME.findall(EXPRESSIONS[name]))
@@ -36,12 +36,12 @@ def _spelled(name: str) -> int:
 
 @cache
 def _is_apart(name: str) -> bool:
-    """Return True if DuckDB must not inline the SQL expression of a measure, because it is too large."""
+    """Return True if DuckDB must compute a measure separately, because its SQL is too large to repeat."""
     return name in MARKS or _spelled(name) > _WRITTEN_OUT
 
 
 def pair_sql(name: str, column: Callable[[str], str], without: Marks = frozenset()) -> str:
-    """Return the SQL expression of a measure of an object pair, with SQL for its input columns.
+    """Return a measure's SQL expression. ``column`` returns the SQL text for each of its inputs.
 
     DuckDB moves a condition below a layer by inlining the layer's expressions. For ``wttc`` these
     are 21 million columns, and for some others it takes a minute. A volatile column prevents this.
@@ -59,14 +59,14 @@ _BEFORE_KINDS: Final = 10
 
 
 def _is_of(name: str, one: str) -> bool:
-    """Return True if an SQL part is a function (such as a sine) of columns of only one object."""
+    """Return True if an input of SQL expressions is a function (such as sine) of columns of one object only."""
     return "(" in EXPRESSIONS.get(name, "") and all(
         part[:2] == f"{one}_" and part not in EXPRESSIONS for part in parts_of(name)
     )
 
 
 def _side(one: str, names: Sequence[str]) -> str:
-    """Return SQL of object states for one side (a or b) of a pair, with precomputed functions."""
+    """Return SQL for the states of object a or b of a pair, with extra columns such as sines."""
     made = [f"{pair_sql(name, lambda n: f'{n[2:]}::DOUBLE')} AS {name}" for name in names]
     if one == "b":
         return f"(SELECT {', '.join(['*', *made])} FROM inside.state) b"  # noqa: S608
@@ -97,7 +97,7 @@ _CALLED: Final = {
 
 
 def _marked(pairs: str) -> str:
-    """Return SQL of object pairs with flags for special pairs: other storey, or carrier and load."""
+    """Return SQL that adds flags to object pairs: different storeys, or carrier and load."""
     heights = {
         f"{one}_{side}": made
         for one in "ab"
@@ -121,7 +121,7 @@ def _part_of_mark(name: str) -> str:
 
 
 def pairs_view(view: str = "pairs") -> tuple[str, str]:
-    """Return the SQL of a view with all measures of object pairs, and the comment of its columns.
+    """Return the SQL of a view with all measures of object pairs, and comments for its columns.
 
     Parameters
     ----------

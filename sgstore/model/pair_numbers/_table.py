@@ -48,7 +48,7 @@ Marks = frozenset[str]
 
 @cache
 def expression_of(name: str, without: Marks) -> str:
-    """Return the SQL expression of a measure, without the tests for special pairs in ``without``."""
+    """Return a measure's SQL expression. Leave out the tests for special pairs in ``without``."""
     text = EXPRESSIONS[name]
     for mark in without:
         text = text.replace(f" + {mark}", "").replace(f"{mark} > 0 OR ", "")
@@ -57,13 +57,13 @@ def expression_of(name: str, without: Marks) -> str:
 
 @cache
 def parts_of(name: str, without: Marks = frozenset()) -> tuple[str, ...]:
-    """Return the names of the inputs in a measure's SQL expression: columns and other measures."""
+    """Return the inputs of a measure's SQL expression, by name: columns and other measures."""
     return tuple(sorted({*NAME.findall(expression_of(name, without))}))
 
 
 @cache
 def stage_of(name: str, without: Marks = frozenset()) -> int:
-    """Return the nesting depth of a measure's SQL expression; 0 for a column of an object."""
+    """Return how deep the SQL expression of a measure is nested; 0 for a column of an object."""
     if name not in EXPRESSIONS:
         return 0
     return 1 + max(stage_of(part, without) for part in parts_of(name, without))
@@ -71,7 +71,7 @@ def stage_of(name: str, without: Marks = frozenset()) -> int:
 
 @cache
 def needed_for(name: str, without: Marks = frozenset()) -> frozenset[str]:
-    """Return a measure with the names of all its inputs, recursively; empty for a map look-up.
+    """Return the names of a measure and of all its direct and indirect inputs; empty for a map look-up.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Measure of object pairs: earliest possible contact if both accelerate only mildly."""
+"""Measure of object pairs: earliest possible contact if both accelerate only a little."""
 
 from __future__ import annotations
 
