@@ -101,11 +101,11 @@ class Entity(NamedTuple):
 
     @property
     def constants(self) -> tuple[int, str, str]:
-        """Attributes (kind and names) that must stay the same while the object exists."""
+        """Attributes that must not change while the object exists: kind, special role and subkind."""
         return self.kind, self.special, self.subkind
 
     def meant(self, told: TypeMeaning | None) -> Entity:
-        """Return the object with its kind replaced by the type mapping. Without a mapping it is unchanged."""
+        """Return the object with the kind that the type mapping defines; unchanged without a mapping."""
         if told is None:
             return self
         kind = KIND_CODE[told.kind]
@@ -113,7 +113,7 @@ class Entity(NamedTuple):
 
 
 class Frame:
-    """Moment of a scene: time, objects, lights and events, added by the caller.
+    """Frame of a scene that the caller builds: time, objects, lights and events.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ class Frame:
         return len(self.entities)
 
     def meant(self, types: Mapping[str, TypeMeaning]) -> Frame:
-        """Return the frame with the kinds of its objects replaced by the type mapping of the settings.
+        """Return the frame with the kinds that the settings define for the type names of its objects.
 
         Examples
         --------
@@ -192,7 +192,7 @@ class Frame:
         return f"Frame({self.time_ns}, ego={self.ego!r}, {len(self)} entities)"
 
     def happened(self, kind: str, ident: str | int = "", other: str | int = "") -> None:
-        """Add an event to the frame. The query ``HAPPENS kind(a, b)`` is true in this frame.
+        """Add an event to the frame. The query ``HAPPENS kind(a, b)`` then matches this frame.
 
         Parameters
         ----------
@@ -365,7 +365,7 @@ class Frame:
 
     @classmethod
     def from_dict(cls, told: Mapping[str, Any]) -> Frame:
-        """Return the frame of plain values, the inverse of :meth:`as_dict`.
+        """Return the frame that plain values describe, as made by :meth:`as_dict`.
 
         Raises
         ------
@@ -410,7 +410,7 @@ class Frame:
         return frame
 
     def _plausible(self, ident: str, pose: tuple[float, ...]) -> tuple[float, ...]:
-        """Return pose and motion values with implausible values removed. Removed values are reported as losses.
+        """Remove implausible values from pose and motion. Each removed value is reported as a loss.
 
         An unknown position is reported, too, because the graph then lacks the entity.
         """
@@ -424,7 +424,7 @@ class Frame:
 
 
 def _inside(name: str, value: float) -> float:
-    """Convert a number to internal units: degrees to radians, infinite values to NaN."""
+    """Convert a number to internal units: degrees become radians, infinite values become NaN."""
     value = float(value)
     if not math.isfinite(value):
         return _NAN
@@ -493,7 +493,7 @@ def replayed(blocks: Iterable[FrameBlock], recorded: Iterable[str] = ()) -> Iter
 
 
 def _recording(frame: Frame, events: Iterable[Event], known: set[str]) -> Frame:
-    """Return a frame with its events added. Also add the kinds of these events to ``known``."""
+    """Return a frame with its events added. Add the kinds of these events to ``known``."""
     frame.events += [(event.kind, event.ident, event.other) for event in events]
     known.update(kind for kind, _, _ in frame.events)
     frame.recorded = frozenset(known)
@@ -512,7 +512,7 @@ class Replay:
         self._trailers: list[str] = []
 
     def frames(self, block: FrameBlock) -> Iterator[Frame]:
-        """Yield the frames of the next block of a recording. Their values are unchanged."""
+        """Yield each frame of the next block of a recording, with unchanged values."""
         new = block.entities
         columns = (new.ident, new.kind.tolist(), new.special, new.subkind, new.type_name)
         columns = (*columns, new.static.tolist(), new.map_ref)
@@ -595,7 +595,7 @@ class EntityConstants(NamedTuple):
 
 
 class Records:
-    """Converter from blocks of graphs in columns to single scene graphs.
+    """Converter from blocks of graphs, stored as columns, to single scene graphs.
 
     Parameters
     ----------
@@ -614,7 +614,7 @@ class Records:
             self._map = MapRecords(about, edges.src, edges.relation, edges.dst, reach)
 
     def stand(self, known: EntityConstants, states: States, row: int) -> None:
-        """Keep the attributes of a static object, because the recording gives its pose only once."""
+        """Remember the attributes of a static object, because a recording contains its pose only once."""
         numbers = {name: float(getattr(states, name)[row]) for name in _BOX}
         numbers["heading"] = float(np.degrees(wrapped(states.heading[row])))
         about = known.attributes(is_ego=False, is_static=True)
@@ -654,7 +654,7 @@ class Records:
         outer: Ints,
         known: dict[int, EntityConstants],
     ) -> SceneGraph:
-        """Return the scene graph of one frame, optionally with the objects around it."""
+        """Return the scene graph of one frame, with or without the objects outside its range."""
         frames = graph.frames
         states = chained([part.frames.states for part in parts])
         presence = chained([part.presence for part in parts])
@@ -691,7 +691,7 @@ class Records:
 
 
 def _map_node(road_map: RoadMap, node: int) -> Attributes:
-    """Return the scene graph attributes of a road map node."""
+    """Return the attributes of a road map node in a scene graph."""
     nodes, row = road_map.nodes, -1 - node
     texts = {name: getattr(nodes, name)[row] for name in _MAP_TEXTS}
     numbers = {name: float(getattr(nodes, name)[row]) for name in _MAP_NUMBERS}
@@ -736,7 +736,7 @@ def _moving(states: States) -> list[Attributes]:
 
 
 def _coded(lights: int, light: int, derived: int, gear: float, hand_brake: float) -> Attributes:
-    """Return node attributes from codes: vehicle lights, derived values, gear and hand brake."""
+    """Convert codes to node attributes: vehicle lights, derived values, gear and hand brake."""
     about: Attributes = {}
     if lights >= 0:
         about |= {name: bool(lights >> bit & 1) for bit, name in enumerate(VEHICLE_LIGHTS)}
@@ -787,7 +787,7 @@ def _gaps(gaps: LaneGaps, outer: Ints) -> Iterator[tuple[int, int, int, Attribut
 
 
 def _outward(nodes: Whole, outer: Ints) -> Ints:
-    """Convert the node ids of a block to the ids in the returned scene graphs."""
+    """Replace the node ids of a block by the ids that the returned scene graphs use."""
     return np.where(nodes >= 0, outer[np.maximum(nodes, 0)], nodes)
 
 
@@ -809,7 +809,7 @@ SPARE: Final = 2048
 
 
 class Generator(Protocol):
-    """Interface of the scene graph generator that works on blocks of frames."""
+    """Interface of a scene graph generator that processes blocks of frames."""
 
     @property
     def kinds(self) -> Codes:
@@ -817,7 +817,7 @@ class Generator(Protocol):
         ...
 
     def blocks(self, frames: FrameBlock, egos: Sequence[Ints]) -> list[GraphBlock]:
-        """Return the graphs of the next frames as columns, one block per ego."""
+        """Return the graphs of the next frames as columns: one block of graphs for each ego."""
         ...
 
 
@@ -912,7 +912,7 @@ class Stepper:
             return [replace(one, events=happened, topics=frame.topics) for one in found]
 
     def _happened(self, frame: Frame) -> dict[str, list[tuple[int | None, int | None]]]:
-        """Return the events of a frame by kind, with node ids. Every kind recorded so far has an entry."""
+        """Return the events of a frame by kind, with node ids. Earlier kinds have at least an empty list."""
         found: dict[str, list[tuple[int | None, int | None]]] = {k: [] for k in frame.recorded}
         for kind, *idents in frame.events:
             a, b = (self._node_of(ident) for ident in idents)
@@ -965,7 +965,7 @@ class Stepper:
         return EntityConstants(node, entity.ident, KINDS[entity.kind], *texts, lifetime)
 
     def _follow(self, entity: Entity, time_ns: int) -> None:
-        """Record the position of an object. An object that reuses the id of another one is a new object."""
+        """Record the position of an object. If the id belonged to another object before, it is a new object."""
         lives = self._moving[entity.ident]
         place = (_NAN,) * 3 if entity.whole[_LIGHT] >= 0 else entity.numbers[:3]
         here = Sight(place, time_ns, self._run)
@@ -973,7 +973,7 @@ class Stepper:
         self._moving.move_to_end(entity.ident)
 
     def _block(self, frame: Frame, moving: list[Entity], standing: list[Entity]) -> FrameBlock:
-        """Convert a frame to a block in columns, with node ids."""
+        """Convert a single frame to a :class:`FrameBlock`, with node ids."""
         first = self._introduced
         new = [*standing, *(e for e in moving if self._node(e) not in self._inner)]
         self._introduced += len(new)
@@ -997,7 +997,7 @@ class Stepper:
         )
 
     def _kept(self, block: FrameBlock) -> FrameBlock:
-        """Round the values of a block of frames to the precision of a store."""
+        """Round the values of a block of frames as a store does."""
         self._origin = self._origin or origin_of(block)
         return quantize(block, self._origin or Origin(0.0, 0.0, 0.0))
 
@@ -1021,7 +1021,7 @@ class Stepper:
 
 
 def check_entities(frame: Frame, is_static: Callable[[str], bool | None]) -> None:
-    """Raise an error if a frame contradicts itself or earlier frames.
+    """Raise an error if a frame has contradictory objects, or objects that contradict earlier frames.
 
     Parameters
     ----------

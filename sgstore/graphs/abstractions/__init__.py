@@ -1,4 +1,4 @@
-"""Abstractions: simpler labelled graphs from the literature, made from scene graphs, with a class per graph.
+"""Abstractions: simpler labelled graphs from the literature, made from scene graphs, and their graph classes.
 
 An abstraction is a function from columns (:class:`GraphColumns`) to columns (:class:`Labelled`).
 :data:`ABSTRACTIONS` lists the built-in ones. Users add their own with :func:`register`, or as an

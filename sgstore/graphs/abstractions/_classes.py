@@ -1,4 +1,4 @@
-"""Classes of labelled graphs. Isomorphic graphs have the same class, computed from a canonical form.
+"""Classes of labelled graphs. Isomorphic graphs have the same class. It is computed from a canonical form.
 
 The search finds an order of the nodes that depends on the graph only, even if colours do not
 distinguish all nodes.
@@ -51,7 +51,7 @@ class TooSymmetricError(Exception):
 
 @dataclass(slots=True)
 class SymmetrySearch:
-    """Search for the canonical node order of one graph, which is the same for isomorphic graphs.
+    """Search for a canonical order of the nodes of a graph. Isomorphic graphs have the same ordered form.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ class SymmetrySearch:
     def order(
         self, colours: Sequence[int], edges: Iterable[tuple[int, int, int]]
     ) -> list[int] | None:
-        """Return the nodes in a canonical order, the same for isomorphic graphs up to automorphisms.
+        """Return the nodes of a graph in canonical order. Isomorphic graphs are equal in this order.
 
         Parameters
         ----------
@@ -90,7 +90,7 @@ class SymmetrySearch:
             return None
 
     def _canonical(self, arcs: Arcs, colour: dict[int, int]) -> list[int]:
-        """Return the canonical node order of a graph. Colours are refined and components ordered one by one."""
+        """Return the canonical node order of a graph: colour refinement first, then each component."""
         colour = self._refined(arcs, colour)
         sizes = Counter(colour.values())
         alone = sorted((n for n in colour if sizes[colour[n]] == 1), key=colour.__getitem__)
@@ -164,7 +164,7 @@ class SymmetrySearch:
 
 
 def _telling(arcs: Arcs, colour: dict[int, int], sizes: Counter[int]) -> Arcs:
-    """Return only the edges of a graph that can distinguish nodes of equal colour."""
+    """Return the edges of a graph without those that exist between all nodes of two colours."""
     many = Counter(
         (colour[src], label, colour[dst]) for src, to in arcs.items() for dst, label in to.items()
     )
@@ -206,7 +206,7 @@ def _components_of_graph(arcs: Arcs) -> list[Arcs]:
 
 
 def _form(arcs: Arcs, colour: dict[int, int], order: Sequence[int]) -> Form:
-    """Return a graph as the colours of its nodes in the given order, and its edges by position in the order."""
+    """Return a graph in a given node order: the colour of each node, and the edges by node position."""
     place = {node: i for i, node in enumerate(order)}
     edges = sorted(
         (place[src], place[dst], label) for src, to in arcs.items() for dst, label in to.items()
@@ -253,7 +253,7 @@ _EDGE: Final = np.dtype([("src", "<u4"), ("dst", "<u4"), ("low", "<u8"), ("high"
 
 
 def classes_of(graphs: Labelled, work: int = WORK) -> list[str]:
-    """Return a class per graph: 32 hexadecimal digits, or empty for a too symmetric graph.
+    """Return the class of each graph: 32 hexadecimal digits, or empty if the graph is too symmetric.
 
     Raises
     ------
@@ -264,7 +264,7 @@ def classes_of(graphs: Labelled, work: int = WORK) -> list[str]:
 
 
 class Classes:
-    """Cache for the classes of graphs: isomorphic graphs have the same class.
+    """Cache for the classes of graphs. Isomorphic graphs have the same class.
 
     Parameters
     ----------
@@ -295,7 +295,7 @@ _TOLD[[RELATION_CODE[name] for name in OF_JUNCTION]] = True
 
 
 def contents_of(seen: GraphColumns) -> list[bytes]:
-    """Return a 256-bit hash per frame. Equal hashes mean equal classes in all standard abstractions.
+    """Return a 256-bit hash for each frame. Equal hashes mean equal classes in the standard abstractions.
 
     The bits cover the nodes, the edges of ``junction``, and the lanes relative to the ego. Two
     equal frames have the same classes in ``E``, ``EL``, ``ER``, ``RSV`` and ``junction``; only one
@@ -313,7 +313,7 @@ def contents_of(seen: GraphColumns) -> list[bytes]:
 
 
 def _told(sums: Words, sort: int, frame: Ints, *columns: NDArray[Any]) -> None:
-    """Hash table rows, and add the hashes to the sums of their frames."""
+    """Compute a hash of each table row, and add it to the sum of the row's frame."""
     if not len(frame):
         return
     words = np.full(len(frame), sort, np.uint64)
@@ -327,7 +327,7 @@ def _told(sums: Words, sort: int, frame: Ints, *columns: NDArray[Any]) -> None:
 
 @dataclass(frozen=True)
 class _Block:
-    """Labelled graphs of several frames in columns, with nodes sorted by graph.
+    """Labelled graphs of several frames as columns. Nodes are sorted by graph.
 
     Parallel edges are merged: the words of the label are the sums of their words, which still
     distinguish any two sets. ``low`` and ``high`` are the two words of the digests of labels.
@@ -403,7 +403,7 @@ class _Block:
         return [blake2b(row.astype("<u8").tobytes(), digest_size=16).digest() for row in sums]
 
     def taken(self, rows: list[int]) -> _Block:
-        """Return selected labelled graphs of the block, in ascending order."""
+        """Return some of the labelled graphs in the block, given in ascending order."""
         if len(rows) == self.graphs:
             return self
         number = np.full(self.graphs, -1)
@@ -437,7 +437,7 @@ def _digests(labels: tuple[str, ...]) -> NDArray[np.uint64]:
 
 
 def _on_edges(words: Words, bundles: tuple[tuple[int, ...], ...]) -> Words:
-    """Return the hash words of edge labels, followed by those of label sets."""
+    """Return the hashes of edge labels, followed by the hashes of label sets."""
     words = _mixed(words)
     several = bundles[::-1]
     flat = np.array([label for bundle in several for label in bundle], np.int64)
@@ -455,7 +455,7 @@ def _mixed(words: Words) -> Words:
 
 
 def _sums(owner: Ints, values: Words, count: int) -> Words:
-    """Return the sum (modulo 2⁶⁴) of the hash words of each owner, a graph or a node."""
+    """Return for each graph (or node) the sum of its hashes, modulo 2⁶⁴."""
     total = np.zeros(count, np.uint64)
     if len(owner):
         starts = np.flatnonzero(begins(owner))
@@ -500,7 +500,7 @@ def _cells(block: _Block, colour: Words) -> Ints:
 
 
 def _ordered(block: _Block, colour: Words, work: int) -> tuple[Ints, Bools]:
-    """Return the nodes of each graph in canonical order, and a mask of the ordered graphs."""
+    """Return the nodes of each graph in canonical order, and a mask of graphs with a successful search."""
     nodes = len(block.graph)
     order = np.lexsort((colour, block.graph))
     cell = np.zeros(nodes, np.int64)
@@ -524,7 +524,7 @@ def _ordered(block: _Block, colour: Words, work: int) -> tuple[Ints, Bools]:
 
 
 def _components_of_block(block: _Block, cell: Ints, size: Ints) -> Ints:
-    """Return the component of each node. Components are joined by edges that distinguish equal colours."""
+    """Return the component of each node. Only edges that can distinguish equal colours join components."""
     src, dst = block.src, block.dst
     rows = np.flatnonzero((src != dst) & (size[cell[src]] > 1) & (size[cell[dst]] > 1))
     if not len(rows):
@@ -540,7 +540,7 @@ def _components_of_block(block: _Block, cell: Ints, size: Ints) -> Ints:
 
 
 def _searched(block: _Block, cell: Ints, rows: Ints, number: int, work: int) -> Ints | None:
-    """Return the nodes of one graph in canonical order, or ``None`` if the search exceeds its limit."""
+    """Return the nodes of one graph in canonical order; ``None`` if the search exceeds its limit."""
     first, last = np.searchsorted(block.edge_graph, [number, number + 1])
     src, dst = block.src[first:last], block.dst[first:last]
     low, high = block.low[first:last].tolist(), block.high[first:last].tolist()
@@ -559,7 +559,7 @@ def _searched(block: _Block, cell: Ints, rows: Ints, number: int, work: int) -> 
 
 
 def _hashed(block: _Block, order: Ints, known: Bools) -> list[str]:
-    """Return a hash per graph, from the canonical node order."""
+    """Return a hash of each graph, computed in canonical node order."""
     place = np.empty(len(order), np.int64)
     place[order] = np.arange(len(order))
     nodes = np.stack([block.node_low[order], block.node_high[order]], axis=1).astype("<u8")

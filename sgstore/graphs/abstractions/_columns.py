@@ -55,7 +55,7 @@ _LANE: Final = KIND_CODE["lane"]
 
 @dataclass(frozen=True, eq=False)
 class MapColumns:
-    """Nodes and edges of a road map as columns. The node in row i has the id -1 - i.
+    """Nodes and edges of a road map as columns. The node in row ``i`` has the id ``-1 - i``.
 
     Attributes
     ----------
@@ -105,7 +105,7 @@ class MapColumns:
 
     @cached_property
     def driving(self) -> Bools:
-        """Mask (K,) of the map nodes that are driving lanes."""
+        """Mask (K,) of the map nodes that are lanes for driving."""
         return (self.kind == _LANE) & np.array([of in DRIVING for of in self.lane_type], np.bool_)
 
 
@@ -160,7 +160,7 @@ class GraphColumns:
 
     @classmethod
     def sorted(cls, frames: int, nodes: Mapping[str, Any], **columns: Any) -> GraphColumns:
-        """Sort node columns by frame and node id, and return the graphs."""
+        """Create graphs from node columns in any order. They are sorted by frame and node id."""
         order = np.lexsort((nodes["node"], nodes["node_frame"]))
         return cls(frames, **{name: of[order] for name, of in nodes.items()}, **columns)
 
@@ -210,7 +210,7 @@ class GraphColumns:
         )
 
     def lasting(self, relations: Sequence[int]) -> tuple[Ints, Codes, Ints, Ints]:
-        """Return the map edges of each frame that contains both of their nodes.
+        """Return the static map edges in each frame, where both nodes of the edge are in the frame's graph.
 
         Returns
         -------
@@ -239,7 +239,7 @@ class GraphColumns:
 
     @cached_property
     def pairs(self) -> tuple[Ints, Ints, Ints, Ints]:
-        """Pairs of traffic objects with at least one relation: frame, two nodes, and the relations as bits.
+        """Pairs of traffic objects with at least one relation: frame, both nodes, and one bit per relation.
 
         Returns
         -------
@@ -264,7 +264,7 @@ class GraphColumns:
         return frame, node[starts[frame] + a], node[starts[frame] + b], bits
 
     def taken(self, frames: Ints) -> GraphColumns:
-        """Return the graphs of selected frames, in ascending order."""
+        """Return the graphs of some frames, given in ascending order."""
         if len(frames) == self.frames:
             return self
         number = np.full(self.frames, -1)
@@ -292,7 +292,7 @@ class GraphColumns:
 
 
 def _united(cell: Ints, bit: Ints, bound: int) -> tuple[Ints, Ints]:
-    """Return the distinct keys in ascending order, and for each key the bitwise OR of its bits."""
+    """Return the distinct keys, ascending, and all bits of each key combined (bitwise OR)."""
     if bound <= _CELLS:
         sums = np.bincount(cell, weights=np.exp2(bit))
         cells = np.flatnonzero(sums)
@@ -307,7 +307,7 @@ def _united(cell: Ints, bit: Ints, bound: int) -> tuple[Ints, Ints]:
 
 
 def found(frames: Ints, nodes: Ints, frame: Ints, node: Ints) -> Ints:
-    """Return the row of each (frame, node) pair in sorted columns; -1 if it is missing."""
+    """Return the row of each (frame, node) pair in sorted columns; -1 if it does not occur."""
     if not len(nodes):
         return np.full(len(node), -1)
     low, span = int(nodes.min()), int(nodes.max()) - int(nodes.min()) + 1
@@ -415,7 +415,7 @@ class Labelled:
         )
 
     def related(self) -> tuple[Ints, Ints, Ints, Ints]:
-        """Return edges whose label is a relation: frame, source, relation code, destination."""
+        """Return the edges whose label is a relation, as frame, source, relation code and destination."""
         code = {name: i for i, name in enumerate(RELATIONS)}
         parts = [(code.get(text, -1),) for text in self.labels]
         bundles = [tuple(parts[label][0] for label in bundle) for bundle in self.bundles]
@@ -431,7 +431,7 @@ class Labelled:
         return self.frame[edge], self.src[edge], relation[known], self.dst[edge]
 
     def named(self, number: int) -> tuple[dict[str, str], list[tuple[str, str, str]]]:
-        """Return one graph by names: nodes ``name → label``, and edges ``(name, label, name)``.
+        """Return the graph of one frame by names: nodes ``name → label``, and edges ``(name, label, name)``.
 
         The ego and unique nodes are named by their label, parts of the map by their name, and all
         others ``label_node``, such as ``car_12``.
@@ -475,7 +475,7 @@ def repeated(columns: Part) -> Bools:
 
 @dataclass(frozen=True, slots=True)
 class EgoLanes:
-    """Lanes of many frames with their role relative to the ego, such as left neighbour.
+    """Lanes of many frames with their roles relative to the ego, such as left neighbour.
 
     Attributes
     ----------
@@ -499,7 +499,7 @@ class EgoLanes:
     off_road: Part
 
     def taken(self, number: Ints) -> EgoLanes:
-        """Return the lanes of selected frames, with new frame numbers."""
+        """Return the lanes of some frames. The frames get new numbers."""
 
         def some(frame: Ints, *columns: Ints) -> Part:
             rows = np.flatnonzero(number[frame] >= 0)

@@ -1,4 +1,4 @@
-"""Features of labelled graphs for similarity: counts of nodes by label, and of edges by labels.
+"""Features of labelled graphs, to compute similarity: counts of node labels and of edges.
 
 The weighted Jaccard index (Ruzicka's similarity) compares two graphs as multisets of features:
 ``sum(min) / sum(max)`` over the counts. It is 1 for isomorphic graphs, and for few others; 0
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class GraphFeatures:
-    """Label counts of many graphs: one row for each frame and feature (node label, or edge with end labels).
+    """Counts of features in many graphs. A feature is a node label, or an edge with the labels of its ends.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class GraphFeatures:
 
     @classmethod
     def of(cls, graphs: Labelled) -> GraphFeatures:
-        """Count the node labels and edge labels of labelled graphs."""
+        """Count the features (node labels and edges) of labelled graphs."""
         label = graphs.node_label.astype(np.int64)
         frame, src, edge, dst = _single(graphs)
         ends = [label[found(graphs.node_frame, graphs.node, frame, end)] for end in (src, dst)]
@@ -61,7 +61,7 @@ class GraphFeatures:
         return cls(graphs.frames, texts, at, feature, count)
 
     def counts(self, number: int) -> Counter[str]:
-        """Return the label counts (features) of one frame's graph."""
+        """Return how often each feature (node label or edge) occurs in one frame's graph."""
         rows = np.flatnonzero(self.frame == number)
         names = (self.texts[i] for i in self.feature[rows].tolist())
         return Counter(dict(zip(names, self.count[rows].tolist(), strict=True)))
@@ -75,7 +75,7 @@ class GraphFeatures:
         return np.divide(shared, either, out=np.ones(self.frames), where=either > 0)
 
     def digests(self) -> NDArray[np.uint64]:
-        """Return a hash of each frame, (frames,). Frames with equal label counts have equal hashes."""
+        """Return a hash of each frame, (frames,). Frames with equal feature counts have equal hashes."""
         hashes = [blake2b(text.encode(), digest_size=8).digest() for text in self.texts]
         mixed = np.frombuffer(b"".join(hashes) or bytes(8), "<u8").astype(np.uint64)
         sums = np.zeros(self.frames, np.uint64)
@@ -84,7 +84,7 @@ class GraphFeatures:
 
 
 def without(graphs: Labelled, ignored: Iterable[str]) -> Labelled:
-    """Return labelled graphs without the given labels: nodes with their edges, and edges.
+    """Remove all nodes and edges with given labels from labelled graphs, and the edges of removed nodes.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ def without(graphs: Labelled, ignored: Iterable[str]) -> Labelled:
 
 
 def of_frames(graphs: Labelled, chosen: Bools) -> Labelled:
-    """Return the labelled graphs with the graphs of all frames outside ``chosen`` emptied."""
+    """Return the labelled graphs with an empty graph for each frame that is not in ``chosen``."""
     nodes, edges = chosen[graphs.node_frame], chosen[graphs.frame]
     return replace(
         graphs,
@@ -131,7 +131,7 @@ def of_frames(graphs: Labelled, chosen: Bools) -> Labelled:
 
 
 def _single(graphs: Labelled) -> tuple[Ints, Ints, Ints, Ints]:
-    """Return one row for each label of each edge: frame, source, label, destination."""
+    """Return a row for each label of each edge: frame, source, label, destination."""
     label = graphs.label.astype(np.int64)
     if not graphs.bundles:
         return graphs.frame, graphs.src, label, graphs.dst

@@ -41,7 +41,7 @@ UNNAMED: Final = -(1 << 21)
 
 
 class Strands:
-    """Strands of a map (chains of consecutive lanes), with their left and right neighbours.
+    """Strands of a map (chains of consecutive lanes), and the left and right neighbours of each.
 
     Attributes
     ----------
@@ -79,7 +79,7 @@ class Strands:
         return self._roles[ego]
 
     def _beside(self, grounds: MapColumns, relation: str) -> defaultdict[int, set[int]]:
-        """Return the neighbours of each strand (chain of lanes) on one side, in the same direction."""
+        """Return the neighbours of each strand (chain of lanes) on one side that have the same direction."""
         against = grounds.relation == RELATION_CODE["opposes"]
         pairs = set(zip(grounds.src[against].tolist(), grounds.dst[against].tolist(), strict=True))
         rows = np.flatnonzero(grounds.relation == RELATION_CODE[relation])
@@ -163,7 +163,7 @@ _NONE: Final = np.zeros(0, np.int64)
 
 
 def ego_lanes(seen: GraphColumns) -> EgoLanes:
-    """Return the lanes of each frame with their role relative to the ego; empty without a map."""
+    """Return the lanes of each frame, with their roles relative to the ego; empty without a map."""
     if seen not in LANES_OF:
         LANES_OF[seen] = _found(seen)
     return LANES_OF[seen]
@@ -185,7 +185,7 @@ def _found(seen: GraphColumns) -> EgoLanes:
 
 
 def lane_roles(seen: GraphColumns) -> tuple[Ints, Ints, list[str]]:
-    """Return frame, lane and role name for each lane with a role relative to the ego.
+    """Return frame, lane and role name of each lane that has a role relative to the ego.
 
     Returns
     -------
@@ -215,7 +215,7 @@ def lane_roles(seen: GraphColumns) -> tuple[Ints, Ints, list[str]]:
 
 
 def _inside(seen: GraphColumns) -> tuple[Ints, Ints, Ints]:
-    """Return (frame, traffic object, lane) for all objects on lanes."""
+    """Return frame, object and lane of each traffic object on a lane."""
     rows = np.flatnonzero((seen.relation == _IS_IN) & (seen.src >= 0) & (seen.dst < 0))
     entity = seen.row_of(seen.frame[rows], seen.src[rows])
     rows = rows[(entity >= 0) & seen.is_traffic[entity]]
@@ -223,7 +223,7 @@ def _inside(seen: GraphColumns) -> tuple[Ints, Ints, Ints]:
 
 
 def _roles(seen: GraphColumns, strands: Strands, inside: Part) -> tuple[Ints, Ints, Ints]:
-    """Return frame, strand of lanes, and role relative to the ego, for each strand in each frame."""
+    """Return frame, strand (chain of lanes), and role relative to the ego, for all strands of all frames."""
     frame, src, strand = inside
     ego = np.where(seen.ego_lane < 0, strands.of[-1 - seen.ego_lane], 0)
     present = np.flatnonzero(seen.kind == KIND_CODE["lane"])
@@ -249,7 +249,7 @@ def _roles(seen: GraphColumns, strands: Strands, inside: Part) -> tuple[Ints, In
 
 
 def _numbered(seen: GraphColumns, inside: Part, lanes: Part) -> Ints:
-    """Return lane roles. Opposing lanes are numbered by the distance of their nearest object from the ego."""
+    """Return lane roles with numbers for opposing lanes: 0 for the one with the object nearest to the ego."""
     here_frame, here, role = lanes
     distance, has_ego = _from_ego(seen)
     rows = np.flatnonzero(role == OPPOSING)
@@ -276,7 +276,7 @@ def _numbered(seen: GraphColumns, inside: Part, lanes: Part) -> Ints:
 
 
 def _from_ego(seen: GraphColumns) -> tuple[NDArray[np.float64], Bools]:
-    """Return the distance of each node from the ego (infinite if unknown), and a mask of frames with an ego."""
+    """Return each node's distance from the ego (infinite if unknown), and a mask of frames with an ego."""
     x, y = (np.full(seen.frames, np.nan) for _ in range(2))
     ego = np.flatnonzero(seen.is_ego)
     x[seen.node_frame[ego]], y[seen.node_frame[ego]] = seen.x[ego], seen.y[ego]

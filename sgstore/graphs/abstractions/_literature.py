@@ -1,4 +1,4 @@
-"""Abstractions from the literature: functions from scene graphs to simpler labelled graphs.
+"""Abstractions from the literature. Each makes simpler labelled graphs from scene graphs.
 
 They are ``E``, ``EL``, ``ER``, ``RSV``, ``junction`` and ``SG``.
 
@@ -73,7 +73,7 @@ _ON_ROADS[[RELATION_CODE[r] for r in OF_JUNCTION if r not in BETWEEN_ENTITIES]] 
 
 
 def _kind_labels() -> tuple[str, ...]:
-    """Return the node labels of abstractions: the kinds by their codes, then the ego."""
+    """Return the node labels that abstractions use: one per kind, in the order of codes, then ``ego``."""
     return (*KINDS, EGO)
 
 
@@ -90,17 +90,17 @@ def related(seen: GraphColumns) -> Labelled:
 
 
 def in_lanes(seen: GraphColumns) -> Labelled:
-    """Abstraction ``EL``: the traffic objects, and the lanes that they are in, relative to the ego."""
+    """Abstraction ``EL``: the traffic objects, and the lanes of each, named relative to the ego."""
     return _with_lanes(seen, related=False)
 
 
 def road_scene(seen: GraphColumns) -> Labelled:
-    """Abstraction ``RSV``: the traffic objects with their relations, and their lanes relative to the ego."""
+    """Abstraction ``RSV``: the traffic objects, their relations, and their lanes named relative to the ego."""
     return _with_lanes(seen, related=True)
 
 
 def related_scene(seen: GraphColumns) -> Labelled:
-    """Abstraction ``RSV_related``: ``RSV`` reduced to objects with a relation to the ego, and their lanes."""
+    """Abstraction ``RSV_related``: ``RSV`` with only the objects related to the ego, and their lanes."""
     found = road_scene(replace(seen, **_rows(seen, _OF_NODES, _related_to_ego(seen))))
     inside = (found.src >= 0) & (found.dst < 0)
     used = np.unique(np.stack([found.frame[inside], found.dst[inside]]), axis=1)
@@ -114,7 +114,7 @@ def related_scene(seen: GraphColumns) -> Labelled:
 
 
 def _related_to_ego(seen: GraphColumns) -> Bools:
-    """Return a mask of the nodes that are scenery, map parts, the ego, or objects with a relation to it."""
+    """Return a mask of the nodes to keep: map parts, scenery, the ego, and objects with a relation to it."""
     ego = np.full(seen.frames, -1)
     ego[seen.node_frame[seen.is_ego]] = seen.node[seen.is_ego]
     frame, src, dst, _ = seen.pairs
@@ -126,7 +126,7 @@ def _related_to_ego(seen: GraphColumns) -> Bools:
 
 
 def _among(frame: Ints, node: Ints, wanted: set[tuple[int, int]]) -> Bools:
-    """Return a mask of all objects, and of the map parts whose (frame, node) is in a given set."""
+    """Return a mask of all objects, and of the map parts that occur as (frame, node) in ``wanted``."""
     pairs = zip(frame.tolist(), node.tolist(), strict=True)
     return np.array([one[1] >= 0 or one in wanted for one in pairs], np.bool_)
 
@@ -141,7 +141,7 @@ _OF_NODES: Final = ("node_frame", "node", "kind", "is_ego", "x", "y", "z", "head
 
 
 def curved_scene(seen: GraphColumns) -> Labelled:
-    """Abstraction ``RSV_curvature``: ``RSV`` with a curve class in the name of the ego's lane, ``Ego Lane@-2``.
+    """Abstraction ``RSV_curvature``: ``RSV`` with the curve class of the ego's lane, such as ``Ego Lane@-2``.
 
     The number counts the thresholds :data:`BENDS` that the turn of the lane over 2 m exceeds; it is positive to
     the left. Without a known curvature, the name stays ``Ego Lane``.
@@ -167,7 +167,7 @@ def curved_scene(seen: GraphColumns) -> Labelled:
 
 
 def _bend(curvature: Floats) -> Ints:
-    """Return how many thresholds each curvature exceeds, positive for left curves."""
+    """Return how many thresholds each curvature exceeds: positive in left curves, negative in right curves."""
     turn = np.degrees(curvature * 2.0)
     return np.sign(turn).astype(np.int64) * np.searchsorted(BENDS, np.abs(turn), side="left")
 
@@ -196,7 +196,7 @@ def whole(seen: GraphColumns) -> Labelled:
 def _with_roles(
     seen: GraphColumns, grounds: MapColumns, label: Ints, first: int
 ) -> tuple[Ints, list[str]]:
-    """Return the node labels. A lane with a role relative to the ego in its name gets the role as label."""
+    """Return the label of each node. A lane whose name is a role relative to the ego gets the role as label."""
     named = strands_of(grounds).named
     roles = np.unique(named[named != UNNAMED])
     if not len(roles):
@@ -209,7 +209,7 @@ def _with_roles(
 
 
 def junction(seen: GraphColumns) -> Labelled:
-    """Abstraction ``junction``: traffic objects with their relations; lanes, roads and junctions."""
+    """Abstraction ``junction``: traffic objects and their relations, lanes, roads and junctions."""
     grounds = seen.grounds
     first = len(_kind_labels())
     wanted = [RELATION_CODE[name] for name in OF_JUNCTION]
@@ -242,7 +242,7 @@ def junction(seen: GraphColumns) -> Labelled:
 
 
 def _drawn(seen: GraphColumns, kept: Bools, columns: Part, whose: Ints | None) -> Part:
-    """Return the edges between merged nodes (such as all sections of a lane), without duplicates and loops."""
+    """Return the edges after nodes were merged (such as sections of a lane), without duplicates and loops."""
     frame, relation, src, dst = columns
     a, b = seen.row_of(frame, src), seen.row_of(frame, dst)
     both = (a >= 0) & (b >= 0) & kept[a] & kept[b]
@@ -265,7 +265,7 @@ def _standing_for(whose: Ints, node: Ints) -> Ints:
 
 @lru_cache(maxsize=_MAPS)
 def _merged(grounds: MapColumns) -> Ints:
-    """Return the node id that represents each map node. All sections of a lane share one id."""
+    """Return for each map node the node that represents it. All sections of a lane have the same one."""
     found = -1 - np.arange(len(grounds.kind))
     lanes = np.flatnonzero(grounds.kind == KIND_CODE["lane"])
     first: dict[tuple[str, int, str], int] = {}
@@ -280,7 +280,7 @@ def _merged(grounds: MapColumns) -> Ints:
 
 @lru_cache(maxsize=_MAPS)
 def _ground_labels(grounds: MapColumns, first: int) -> tuple[Ints, list[str]]:
-    """Return the label of each map node (such as ``Lane`` or a lane type), and the label texts."""
+    """Return the label of each map node (such as ``Lane`` or a lane type), and the texts of all labels."""
     words = {"road": "Road", "junction": "Junction", "off_road": "Off Road"}
     text: list[str] = [
         ("Lane" if driven else f"Lane ({kind_of_lane or 'none'})")
@@ -328,7 +328,7 @@ def _entities(seen: GraphColumns) -> Part:
 
 
 def _relations(seen: GraphColumns) -> tuple[Part, list[list[int]]]:
-    """Return edges between traffic objects, and the relation labels of each edge."""
+    """Return the edges between traffic objects. The label of each edge is a set of relations."""
     frame, src, dst, bits = seen.pairs
     distinct, number = np.unique(bits, return_inverse=True)
     first = len(_kind_labels())
@@ -352,7 +352,7 @@ def _with_lanes(seen: GraphColumns, *, related: bool) -> Labelled:
 
 
 def _lanes(seen: GraphColumns, first: int) -> tuple[list[Part], list[Part], list[str]]:
-    """Return nodes, ``isIn`` edges and labels of lanes relative to the ego."""
+    """Return the lanes relative to the ego as nodes, ``isIn`` edges and label texts."""
     is_in = len(_kind_labels()) + _IS_IN
     lanes = ego_lanes(seen)
     roots = np.unique(lanes.frame)
@@ -438,7 +438,7 @@ _LANE_NODES: Final = ROOT_ROAD - 1 - np.arange(len(LANES))
 
 
 def roadscene2vec(seen: GraphColumns) -> Labelled:
-    """Abstraction ``roadscene2vec``: objects with relations to the ego, in three lanes."""
+    """Abstraction ``roadscene2vec``: objects with relations to the ego, each in one of three lanes."""
     label = np.where(seen.is_ego, _LABEL["ego_car"], _ACTOR[seen.kind])
     rows = np.flatnonzero(label >= 0)
     frames = np.arange(seen.frames)
@@ -462,7 +462,7 @@ def _all(rows: NDArray[np.signedinteger], label: str) -> NDArray[np.signedintege
 
 
 def _of_ego(seen: GraphColumns, rows: NDArray[np.signedinteger]) -> list[Part]:
-    """Return the edges from each object to its left, middle or right lane, and between objects and the ego."""
+    """Return the edges of each object to its lane (left, middle or right), and to and from the ego."""
     ego = np.full(seen.frames, -1)
     own = np.flatnonzero(seen.is_ego)
     ego[seen.node_frame[own]] = own

@@ -1,4 +1,4 @@
-"""Abstractions that only drop nodes and edges of the scene graph, so that queries need no new tables."""
+"""Abstractions that only remove nodes and edges of the scene graph. Queries need no new tables for them."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Subset:
 
     @property
     def kinds(self) -> frozenset[str] | None:
-        """Node kinds that the abstraction keeps; ``None`` means all kinds."""
+        """Node kinds that the abstraction keeps; ``None`` if it keeps all."""
         return None if self.parts is None else (entity_kinds() - {*SCENERY}) | self.parts
 
 

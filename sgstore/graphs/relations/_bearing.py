@@ -58,7 +58,7 @@ DOUBT: Final = 4e-6
 
 
 def _wanted(scene: BlockScene) -> Bools | None:
-    """Return a mask of the object pairs that can have direction relations; ``None`` means all pairs."""
+    """Return a mask of the object pairs that can have direction relations; ``None`` if all can."""
     settings, pairs = scene.config.direction, scene.pairs
     wanted: Bools | None = None
     if settings.within > 0:
@@ -90,13 +90,13 @@ def _direction_edges(scene: BlockScene) -> Edges:
 
 
 def _in_loops(scene: BlockScene) -> bool:
-    """Return True if compiled loops can compute the directions: no limit by distance or kind."""
+    """Return True if compiled loops can compute the direction relations: no limit by distance or kind."""
     settings = scene.config.direction
     return scene.pairs.in_loops and not settings.kinds and not settings.within > 0
 
 
 def _looking(scene: BlockScene, rows: Rows, codes: Codes) -> Edges:
-    """Return direction edges for some pairs, from the seen object to the viewing object."""
+    """Return direction edges for some pairs (a, b). Each edge begins at b, which a sees in this direction."""
     a, b = scene.pairs.some(rows)
     return edges_between(scene, codes, b, a)
 
@@ -104,7 +104,7 @@ def _looking(scene: BlockScene, rows: Rows, codes: Codes) -> Edges:
 def _sectors(
     scene: BlockScene, bounds: tuple[Floats, Floats], names: Codes
 ) -> tuple[Columns, int, Rows]:
-    """Return direction edges of object pairs, and the pairs that need an exact angle."""
+    """Return the direction edges of all pairs, and the pairs near a limit, which need an exact angle."""
     pairs = scene.pairs
     codes, holds = np.empty(len(pairs), np.int8), np.empty(len(pairs), np.bool_)
     ahead, left = pairs.offsets
@@ -128,7 +128,7 @@ def _sectors(
 
 
 def _by_bearing(settings: Direction, pairs: BodyPairs, rows: Rows) -> tuple[Rows, Rows]:
-    """Return the direction relations of object pairs by exact angle. A pair on a limit can have two."""
+    """Return the direction relations of pairs by exact angle. A pair exactly on a limit can have two."""
     bearing = pairs.bearings(rows)
     known = ~np.isnan(bearing)
     rows, bearing = rows[known], bearing[known]
@@ -144,7 +144,7 @@ def _by_bearing(settings: Direction, pairs: BodyPairs, rows: Rows) -> tuple[Rows
 
 
 def _behind(bearing: Floats) -> Bools:
-    """Return a mask of the angles in the rear sector. At ±90°, only the right side counts, as in CARLASGG.
+    """Return a mask of the angles that count as behind. Of ±90°, only the right side counts, as in CARLASGG.
 
     CARLASGG tests its sectors in the order direct front, side front, direct rear, side rear; all of
     them include both bounds. Straight left is 180° in its count; straight right is 360°, not 0°.
@@ -179,7 +179,7 @@ def _side_edges(scene: BlockScene) -> Edges:
 
 
 def _sides(scene: BlockScene, names: Codes, *, is_open: bool) -> tuple[Columns, int, Rows]:
-    """Return left and right edges of object pairs, and the pairs that need an exact angle."""
+    """Return the left and right edges of all pairs, and the pairs that need an exact angle."""
     pairs = scene.pairs
     ahead, left = pairs.offsets
     codes, beside = np.empty(len(pairs), np.int8), np.float32(BESIDE)

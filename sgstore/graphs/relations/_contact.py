@@ -75,7 +75,7 @@ def contacts(bodies: Bodies, unwanted: Bools) -> Iterator[tuple[Rows, Rows]]:
 
 
 def contacts_of(bodies: Bodies, ego: Rows, frames: Bools) -> tuple[Rows, Rows]:
-    """Return the objects that the ego touches in selected frames."""
+    """Return pairs (ego, object) that touch or overlap, in the given frames."""
     mine = ego[bodies.frame]
     near = frames[bodies.frame] & (mine >= 0) & (mine != np.arange(len(bodies)))
     others = np.flatnonzero(near & ~IS_SIGNAL[bodies.kind])
@@ -83,7 +83,7 @@ def contacts_of(bodies: Bodies, ego: Rows, frames: Bools) -> tuple[Rows, Rows]:
 
 
 def _touching(bodies: Bodies, a: Rows, b: Rows) -> tuple[Rows, Rows]:
-    """Return the object pairs that touch, compared in height if it is known."""
+    """Return the pairs of objects that touch or overlap, also in height if it is known."""
     close = bodies.moves[a] | bodies.moves[b]
     a, b = a[close], b[close]
     level = solid_pairs(bodies, a, b) & heights_meet(bodies, a, b)
@@ -96,7 +96,7 @@ def _touching(bodies: Bodies, a: Rows, b: Rows) -> tuple[Rows, Rows]:
 
 
 def _separation(bodies: Bodies, a: Rows, b: Rows) -> Floats:
-    """Return the separation of two footprints (ground rectangles); negative for an overlap; m.
+    """Return the separation of two footprints (ground rectangles); m. Negative if they overlap.
 
     The gap is at least as large. NaN if rounding or a missing size requires the exact gap.
     """

@@ -1,4 +1,4 @@
-"""Frames with very many objects: blocks are split, and frames with too many object pairs are reported."""
+"""Frames with very many objects: blocks are split, and frames with too many object pairs are recorded."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _WIDEST: Final = 1 << 20
 
 
 def pieces(frames: FrameBlock, kinds: Codes, config: Config, egos: int) -> Iterator[FrameBlock]:
-    """Split a block of frames so that each part has a bounded number of object pairs; usually one part.
+    """Split a block of frames so that no part has too many object pairs. Usually, there is one part.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def pieces(frames: FrameBlock, kinds: Codes, config: Config, egos: int) -> Itera
 
 
 def _neighbours(frames: FrameBlock, rows: Rows, config: Config) -> Ints:
-    """Return an upper bound for the number of near object pairs of each frame, (F,)."""
+    """Return an estimate, never too small, of the number of near object pairs in each frame, (F,)."""
     states = frames.states
     reach = max(config.pairs.within, 1.0)
     size = np.nan_to_num(np.hypot(states.length, states.width)[rows])
@@ -96,7 +96,7 @@ def _neighbours(frames: FrameBlock, rows: Rows, config: Config) -> Ints:
 
 
 def _part(frames: FrameBlock, start: int, stop: int) -> FrameBlock:
-    """Return some frames of a block. The first part keeps the new objects and messages of the block."""
+    """Return a range of frames of a block. Only the first range keeps new objects, messages and events."""
     first, last = int(frames.offsets[start]), int(frames.offsets[stop])
     entities, scenery, messages = frames.entities, frames.scenery, frames.messages
     events = frames.events
@@ -121,7 +121,7 @@ def _part(frames: FrameBlock, start: int, stop: int) -> FrameBlock:
 
 
 class Crowds:
-    """Record of the frames of a trace that have too many object pairs."""
+    """Record of the frames in a trace that have too many object pairs."""
 
     def __init__(self) -> None:
         self._found: dict[str, tuple[int, int, int, Loss]] = {}
@@ -138,7 +138,7 @@ class Crowds:
             self._found[what] = count + 1, seq, most, span
 
     def losses(self, config: Config) -> list[Loss]:
-        """Return report entries for the omitted object pairs of crowded frames."""
+        """Return report entries for object pairs that were left out in crowded frames."""
         found: list[Loss] = []
         for what, (count, seq, bodies, span) in self._found.items():
             if what == NEAR:

@@ -1,4 +1,4 @@
-"""Choice of the lane that a vehicle drives in a junction, by the cheapest path along connected lanes.
+"""Choice of the lane in which a vehicle crosses a junction: the cheapest path along connected lanes.
 
 Lanes of a junction overlap, so that one footprint fits several of them. The *driven lane* is on the
 cheapest path along ``travelsTo`` over all frames of a *crossing*, the part of a drive near junctions. The
@@ -81,7 +81,7 @@ LEAST: Final = 0.01
 
 @dataclass(frozen=True, slots=True)
 class _Candidates:
-    """Lanes that vehicles near junctions touch, by vehicle, frame and lane; shape (n,).
+    """Lanes that vehicles touch near junctions, one row per vehicle, frame and lane; shape (n,).
 
     Attributes
     ----------
@@ -121,7 +121,7 @@ _NONE: Final = _Candidates(
 
 
 class _Junctions:
-    """Surface of the junctions of a map, and the links of its lanes."""
+    """Junctions of a map: their area, and the links between its lanes."""
 
     def __init__(self, road_map: RoadMap) -> None:
         net, edges, count = LaneNet(road_map), road_map.edges, len(road_map.ribbons)
@@ -144,7 +144,7 @@ class _Junctions:
         self.surface = road_map.surface_of(np.flatnonzero(self.lanes), NEAR)
 
     def toll(self, src: Ints, dst: Ints) -> Floats:
-        """Return the cost to get from one lane to another between two successive frames."""
+        """Return the cost to change from one lane to another between two frames; 0 if they are linked."""
         key = src * self._count + dst
         beside = np.where(_among(self._beside, key), SIDE, JUMP)
         return np.where(_among(self._linked, key), 0.0, beside)
@@ -156,7 +156,7 @@ _KNOWN: WeakKeyDictionary[RoadMap, _Junctions] = WeakKeyDictionary()
 
 
 def _junctions_of(road_map: RoadMap | None) -> _Junctions | None:
-    """Return the junctions of a map with lanes in junctions. They are computed once for each map."""
+    """Return the junctions of a map; ``None`` if no lane is in a junction. They are computed once per map."""
     if road_map is None:
         return None
     found = _KNOWN.get(road_map)
@@ -172,7 +172,7 @@ def _among(keys: Ints, wanted: Ints) -> Bools:
 
 
 class DrivenLanes:
-    """Choice of the lanes that vehicles drive in the junctions of a map, for one trace.
+    """Choice of the lane of each vehicle in the junctions of a map, for one trace.
 
     Parameters
     ----------
@@ -192,7 +192,7 @@ class DrivenLanes:
         return _junctions_of(self._map)
 
     def chosen(self, blocks: Iterable[FrameBlock]) -> Iterator[FrameBlock]:
-        """Yield the blocks of a recording, with the driven lanes of their states."""
+        """Yield the blocks of a recording. Their states contain the chosen lanes in junctions."""
         if self._junctions is None:
             yield from blocks
             return
@@ -217,7 +217,7 @@ class DrivenLanes:
     def _decided(
         self, junctions: _Junctions, block: FrameBlock | None
     ) -> Iterator[tuple[Ints, Ints]]:
-        """Decide the finished crossings. Yield rows of states, and their lanes as in ``States``.
+        """Choose the lane of each vehicle that has left a junction. Yield rows of states, and their lanes.
 
         ``block`` is the last block so far; ``None`` means that the recording is over.
         """
@@ -243,14 +243,14 @@ class DrivenLanes:
             yield crossings.chosen(cost, crossings.apart(cost) & (crossings.more(cost) < SURE))
 
     def lanes_of(self, boxes: Floats, z: Floats) -> LaneHits:
-        """Return the lanes that footprints of the last yielded block touch, as :class:`RoadMap` does."""
+        """Return the lanes that footprints touch, as :class:`RoadMap` does. Use the cache of the last block."""
         known = self._asked[0] if self._asked else self._map
         if known is None:
             raise ValueError("lanes need a map")
         return known.lanes_of(boxes, z)
 
     def now(self, block: FrameBlock, node: Ints) -> FrameBlock:
-        """Return the next frame of the online mode, with the driven lanes of its states.
+        """Return the next frame in online mode. Its states contain the chosen lanes in junctions.
 
         Parameters
         ----------
@@ -310,7 +310,7 @@ class DrivenLanes:
 
 
 class _Lookups:
-    """Cache of the lanes below the footprints of a block, for the lane choice and for the graphs."""
+    """Cache of the lanes below the footprints in a block. The lane choice and the graphs use it."""
 
     def __init__(self, road_map: RoadMap, box: Floats) -> None:
         self._map, self._box = road_map, box
@@ -353,7 +353,7 @@ def _sorted(tables: Sequence[_Candidates]) -> _Candidates:
 
 
 def _filled(of: _Candidates, run: Ints) -> tuple[_Candidates, Ints]:
-    """Add the lanes that a vehicle leaves and touches again during a crossing, with a high cost."""
+    """If a vehicle leaves a lane and touches it again, add it to the frames between, with a high cost."""
     new = begins(run, of.seq)
     frame, first = np.cumsum(new) - 1, np.flatnonzero(new)
     order = np.lexsort((frame, of.lane, run))
@@ -373,7 +373,7 @@ def _with_lanes(block: FrameBlock, lane: Ints) -> FrameBlock:
 
 
 class _Crossings:
-    """Crossings of junctions by vehicles: candidate lanes, sorted by crossing, frame and lane.
+    """Candidate lanes of vehicles that cross a junction, sorted by crossing, frame and lane.
 
     Parameters
     ----------
@@ -401,7 +401,7 @@ class _Crossings:
         self.metres = np.nan_to_num(metres, nan=LEAST)[self._frame]
 
     def onward(self, cost: Floats) -> Floats:
-        """Return the least cost of a path from the start of the crossing to each candidate lane."""
+        """Return the least cost of a path from the start of a crossing to each candidate lane."""
         return _summed(cost, self._step, self._src, self._dst, self._toll)
 
     def back(self, cost: Floats) -> Floats:
@@ -409,37 +409,37 @@ class _Crossings:
         return _summed(cost, -self._step, self._dst, self._src, self._toll)
 
     def least(self, cost: Floats) -> Floats:
-        """Return, for each candidate, the least cost among all candidates of its frame."""
+        """Return the least cost in the frame of each candidate lane."""
         return np.minimum.reduceat(cost, self._first)[self._frame] if len(cost) else cost
 
     def more(self, cost: Floats) -> Floats:
-        """Return how much each candidate costs more than the cheapest candidate of its frame."""
+        """Return how much more each candidate lane costs than the cheapest one of its frame."""
         return cost - self.least(cost)
 
     def best(self, cost: Floats) -> Ints:
-        """Return the cheapest candidate of each frame."""
+        """Return the cheapest candidate lane of each frame."""
         best = np.flatnonzero(self.more(cost) <= EQUAL)
         return best[begins(self._frame[best])]
 
     def _toll_of(self, cost: Floats) -> Floats:
-        """Return the cost of a lane change between each candidate lane and the best one; 0 without traffic."""
+        """Return the cost to change between each candidate lane and the best one; 0 without traffic."""
         lane, toll = self.of.lane, self._junctions.toll
         best = lane[self.best(cost)][self._frame]
         change = np.minimum(toll(lane, best), toll(best, lane))
         return np.where(self._junctions.traffic[lane] & (lane != best), change, 0.0)
 
     def apart(self, cost: Floats) -> Bools:
-        """Return a mask of the candidate lanes that have no link with the best lane of their frame."""
+        """Return a mask of the candidate lanes that are not linked with the best lane of their frame."""
         return self._toll_of(cost) == JUMP
 
     def may_change(self, cost: Floats) -> Bools:
-        """Return a mask of the candidate lanes that later frames may still prefer to the best lane."""
+        """Return a mask of the candidate lanes that could still become the best lane with later frames."""
         toll, more, own = self._toll_of(cost), self.more(cost), self.of.cost
         fits = own < own[self.best(cost)][self._frame]
         return (toll == JUMP) & (fits | (more < OPEN)) | (toll == SIDE) & (fits | (more < BESIDE))
 
     def chosen(self, cost: Floats, others: Bools) -> tuple[Ints, Ints]:
-        """Return the states in junctions, and their lanes as in ``States``.
+        """Return the rows of states in junctions, and the chosen lane of each as in ``States``.
 
         ``others`` are the candidates that make a choice unsure.
         """
@@ -451,7 +451,7 @@ class _Crossings:
 
 
 def _summed(cost: Floats, step: Ints, src: Rows, dst: Rows, toll: Floats) -> Floats:
-    """Return the cost of the cheapest path that ends at each candidate, frame by frame."""
+    """Return the cost of the cheapest path to each candidate lane, computed frame by frame."""
     total, order = cost.copy(), np.lexsort((dst, step[dst]))
     src, dst, toll = src[order], dst[order], toll[order]
     heads = np.flatnonzero(begins(dst))

@@ -1,4 +1,4 @@
-"""Range of a scene graph around the ego: an area and a storey. Objects inside become nodes.
+"""Range of a scene graph around the ego: an area and a storey. Objects in the range become nodes.
 
 An area is a disc, the inside of a polygon in the ego's axes, or a strip along lines (the lanes
 ahead). An entity is in the area if its footprint touches it, or if its centre is in it, depending
@@ -44,7 +44,7 @@ MOST_POINTS: Final = 1_000_000
 
 @dataclass(frozen=True, slots=True)
 class EgoPoses:
-    """Poses of the ego in F frames. NaN marks frames without an ego.
+    """Poses of the ego in F frames. They are NaN in frames without an ego.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class EgoPoses:
 
 @dataclass(frozen=True, slots=True)
 class LaneHeights:
-    """Points along the centre lines of all lanes, with the lowest and highest point of each lane.
+    """Points along the centre lines of all lanes. Each lane has a lowest and a highest point.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class LaneHeights:
 
 
 class Extent:
-    """Range of scene graphs around the ego, as defined by the settings.
+    """Range of scene graphs around the ego, from the settings.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ class Extent:
         return Outlines(settings, egos, np.array(corners))
 
     def _lines(self, egos: EgoPoses) -> tuple[Rows, Floats]:
-        """Return centre lines of the ego's corridor (the lanes ahead) in pieces: frame, and ends (S, 2, 2)."""
+        """Return centre lines of the ego's corridor (lanes ahead) as straight pieces: frame, ends (S, 2, 2)."""
         length = self.settings.length
         there = np.flatnonzero(_exist(egos, turned=True))
         owner, ends = np.zeros(0, np.intp), np.zeros((0, 2, 2))
@@ -151,7 +151,7 @@ class Extent:
     def _lane_lines(
         self, road_map: RoadMap, centres: Centrelines, egos: EgoPoses, there: Rows
     ) -> tuple[Rows, Floats]:
-        """Return the centre lines of the ego's lane and of the lanes after it, in pieces."""
+        """Return the centre lines of the ego's lane and the lanes that follow it, in straight pieces."""
         points = np.column_stack([egos.x[there], egos.y[there], np.zeros((len(there), 3))])
         points[:, 2] = egos.heading[there]
         hits = road_map.lanes_of(points, egos.ground[there])
@@ -205,7 +205,7 @@ class Areas:
         self.exist = _exist(egos, turned=turned)
 
     def near(self, x: Floats, y: Floats, extent: Floats) -> tuple[Rows, Rows]:
-        """Return pairs (frame, object) that may be inside the area. This is a fast test with false positives.
+        """Return pairs (frame, object) of objects that may be in the area: all inside, and some outside.
 
         Parameters
         ----------
@@ -289,7 +289,7 @@ class Areas:
         raise NotImplementedError
 
     def _level(self, frame: Ints, away: Floats, height: Floats, hung: Bools | None = None) -> Bools:
-        """Return a mask of the positions on the same storey as the ego, by height and distance."""
+        """Return a mask of the positions on the ego's storey, by their height and distance."""
         rise = height - self.egos.ground[frame]
         lowest, highest = self.settings.height
         if hung is not None:  # the lowest possible height
@@ -298,7 +298,7 @@ class Areas:
         return ~off | (np.abs(rise) < self.settings.grade * away) | ~self.exist[frame]
 
     def _keep_storey(self, road_map: RoadMap, heights: LaneHeights, inside: Bools) -> None:
-        """Remove the map nodes on other storeys than the ego from a mask.
+        """In a mask of map nodes, set nodes on another storey than the ego to False.
 
         A lane is on the storey if one of its points within reach is. If no point is within reach,
         the nearest point counts.
@@ -321,7 +321,7 @@ class Areas:
         inside[frame[~kept], 1 + lane[~kept]] = False
 
     def _touch_storey(self, heights: LaneHeights, frame: Ints, lane: Ints) -> Bools:
-        """Return a mask of the lanes with a point on the ego's storey."""
+        """Return a mask of the lanes that have a point on the ego's storey."""
         points, count = heights.points, np.diff(heights.first)[lane]
         owner, point = spread(heights.first[lane], count)
         at = frame[owner]
@@ -349,7 +349,7 @@ class Discs(Areas):
 
 
 class Outlines(Areas):
-    """Areas around the ego: polygons in the ego's axes.
+    """Areas around the ego: polygons that turn with the ego.
 
     Parameters
     ----------
@@ -456,7 +456,7 @@ def _as_boxes(ends: Floats) -> Floats:
 
 
 def _pieces(road_map: RoadMap, lane: Ints, begin: Floats, end: Floats) -> tuple[Rows, Floats]:
-    """Return straight pieces of centre lines between two lengths along them: line index, and ends (S, 2, 2)."""
+    """Return centre lines between two lengths along them, as straight pieces: line, and ends (S, 2, 2)."""
     ribbons = road_map.ribbons
     owner, row = spread(ribbons.offsets[lane], np.diff(ribbons.offsets)[lane] - 1)
     here = (ribbons.along[row] < end[owner]) & (ribbons.along[row + 1] > begin[owner])

@@ -55,7 +55,7 @@ SAME_WAY: Final = np.pi / 4
 
 @dataclass(frozen=True, slots=True)
 class OwnLanes:
-    """Vehicles on their own lanes, sorted by frame, lane and position along the lane; shape (N,).
+    """Vehicles on their own lanes, sorted by frame, lane and position on the lane; shape (N,).
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class OwnLanes:
     along: Floats
 
     def first_in(self, key: Ints, but: Rows) -> tuple[Rows, Rows]:
-        """Find the first vehicle on each lane, except a given one. Return pairs: query row, vehicle row."""
+        """Return the first vehicle on each lane, other than ``but``, as pairs: query row, vehicle row."""
         place = np.searchsorted(self.key, key)
         last = max(len(self.key) - 1, 0)
         itself = (self.row[np.minimum(place, last)] == but) & (place <= last)
@@ -85,7 +85,7 @@ class OwnLanes:
 
 
 def own_hits(net: LaneNet, bodies: Bodies, hits: LaneHits) -> Bools:
-    """Return a mask of the touched lanes that are the object's own lanes."""
+    """Return a mask of touched lanes: True if the lane is an own lane of the object."""
     lane = -2 - hits.lane
     junction = np.full(len(bodies), -1)
     junction[hits.row[hits.primary]] = net.junction[lane[hits.primary]]
@@ -96,7 +96,7 @@ def own_hits(net: LaneNet, bodies: Bodies, hits: LaneHits) -> Bools:
 
 
 def own_lanes(net: LaneNet, bodies: Bodies, standing: Standing) -> OwnLanes:
-    """Return the vehicles on their own lanes, if they face along the lane."""
+    """Return the vehicles on their own lanes that face in the direction of the lane."""
     hits = standing.hits
     lane = -2 - hits.lane
     own = standing.own & (np.abs(hits.heading_error) < np.pi / 2)
@@ -110,7 +110,7 @@ def own_lanes(net: LaneNet, bodies: Bodies, standing: Standing) -> OwnLanes:
 
 
 def next_ahead(net: LaneNet, bodies: Bodies, standing: Standing, limit: float) -> Column:
-    """Return pairs of a vehicle and the next one ahead, with the gap along the lanes.
+    """Return pairs of a vehicle and the next vehicle ahead, with their gap along the lanes.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ def next_ahead(net: LaneNet, bodies: Bodies, standing: Standing, limit: float) -
 def following(
     net: LaneNet, bodies: Bodies, standing: Standing, limit: float
 ) -> tuple[Column, Rows]:
-    """Return the certain pairs of :func:`next_ahead`, and the vehicles whose leader is uncertain."""
+    """Return the certain pairs of :func:`next_ahead`, and the vehicles whose next vehicle is uncertain."""
     found = next_ahead(net, bodies, standing, limit)
     if not len(standing.unsure):
         return found, standing.unsure
@@ -156,7 +156,7 @@ def following(
 
 
 def _beyond(net: LaneNet, own: OwnLanes, limit: float) -> list[Column]:
-    """Find the next vehicle ahead of the last vehicle on each lane, on the following lanes."""
+    """For the frontmost vehicle on each lane, find the next vehicle ahead on the lanes after it."""
     source = np.flatnonzero(np.append(own.key[1:] != own.key[:-1], True)[: len(own.key)])
     at, base = own.lane[source], own.key[source] - own.lane[source]
     distance = net.lengths[at] - own.along[source]
@@ -183,7 +183,7 @@ def _beyond(net: LaneNet, own: OwnLanes, limit: float) -> list[Column]:
 
 
 def _nearer(key: Ints, distance: Floats, best: Best) -> tuple[Rows, Best]:
-    """Return the rows nearer than the best known distance of their key, and the new best distances."""
+    """For each key, return the row that is nearer than the best so far, and the new best distances."""
     known, least = best
     place = np.minimum(np.searchsorted(known, key), max(len(known) - 1, 0))
     again = known[place] == key if len(known) else np.zeros(len(key), np.bool_)
@@ -199,7 +199,7 @@ def _nearer(key: Ints, distance: Floats, best: Best) -> tuple[Rows, Best]:
 
 
 def gaps(bodies: Bodies, ground: MapContext | None) -> LaneGaps:
-    """Return the pairs of a following and a leading vehicle, by node ids, and the gaps along lanes."""
+    """Return the pairs of a following and a leading vehicle as node ids, and their gaps along lanes."""
     none = np.zeros(0, np.intp)
     a, b, gap = (none, none, np.zeros(0)) if ground is None else ground.following
     return LaneGaps(bodies.frame[a], bodies.node[a], bodies.node[b], gap)

@@ -1,4 +1,4 @@
-"""Filter of scene graphs by the settings (kinds, relations, map parts), and renamed kinds of objects."""
+"""Filter of scene graphs by settings (kinds, relations, map parts). Also changes kinds of objects."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class Keeping:
         return kept & (used | ~larger)
 
     def names(self, computed: Iterable[Relation], *, with_map: bool) -> set[str]:
-        """Return the names of the relations that the filtered graphs can have."""
+        """Return the names of the relations that graphs can have after the filter."""
         kept = {one.name for one in computed} - self._without
         of_map = {one.name for one in relations() if one.of_map} if with_map else set[str]()
         lost = {one.name for one in relations() if self._no_lanes and one.needs_lanes}
@@ -102,7 +102,7 @@ class Keeping:
         return self._kinds[kind]
 
     def edges(self, edges: Edges) -> Edges:
-        """Return the edges whose relation and end nodes the settings keep."""
+        """Return the edges that the settings keep, by their relation and both nodes."""
         if self._everything:
             return edges
         kept = self._relations[edges.relation]
@@ -117,7 +117,7 @@ class Keeping:
         return taken(merged, np.sort(np.unique(key, axis=0, return_index=True)[1]))
 
     def lane_states(self, lanes: LaneStates) -> LaneStates:
-        """Return the positions on lanes that the settings keep. Merged lane sections count once."""
+        """Return the positions on lanes that the settings keep. Merged sections of a lane count once."""
         if self._everything:
             return lanes
         kept = self._stays(lanes.lane) & self._relations[RELATION_CODE["isIn"]]
@@ -133,12 +133,12 @@ class Keeping:
         return replace(merged, overlap=overlap)
 
     def gaps(self, gaps: LaneGaps) -> LaneGaps:
-        """Return the gaps along lanes, or none if the settings drop ``leads`` and ``follows``."""
+        """Return the gaps along lanes; an empty table if the settings drop ``leads`` and ``follows``."""
         wanted = self._relations[[RELATION_CODE["leads"], RELATION_CODE["follows"]]].any()
         return gaps if wanted else taken(gaps, np.zeros(0, np.intp))
 
     def present(self, present: Bools) -> Bools:
-        """Return a mask (F, K) of the map nodes in the graphs, given those in range of the ego."""
+        """Reduce a mask (F, K) of the map nodes in range to those that the graphs contain."""
         present = present & self.parts
         if self._same is None:
             return present
@@ -159,7 +159,7 @@ class Keeping:
 
 
 def renamed(entities: Entities, types: Mapping[str, TypeMeaning]) -> Entities:
-    """Return objects with the kinds that the settings define for their type names."""
+    """Return the objects with the kinds that the settings define for their type names."""
     if not types or not len(entities):
         return entities
     kind = entities.kind.copy()

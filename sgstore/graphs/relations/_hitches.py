@@ -54,7 +54,7 @@ _IS_TWO_WHEELER: Final = kinds_mask(tuple(SUPER_KINDS["two_wheeler"]))
 
 
 class Hitches:
-    """Record of the carriers in a trace, such as towing vehicles of trailers, and bicycles of riders."""
+    """Carriers in a trace, such as the towing vehicle of a trailer, or the bicycle of a rider."""
 
     def __init__(self) -> None:
         self._kind: Codes = np.zeros(0, np.int8)
@@ -64,7 +64,7 @@ class Hitches:
         self._said: dict[str, int] = {}
 
     def learn(self, entities: Entities) -> None:
-        """Record the new objects of a block of frames: possible carriers and loads."""
+        """Record the new objects of a block of frames, as possible carriers and loads."""
         count = len(entities)
         self._kind = np.append(self._kind, entities.kind)
         self._seen = np.append(self._seen, np.zeros(count, np.bool_))
@@ -78,7 +78,7 @@ class Hitches:
             self._carrier[self._vehicles[trailer]] = self._said.pop(trailer)
 
     def see(self, frames: FrameBlock, bodies: Callable[[Rows], Bodies]) -> Ints:
-        """Return the carrier of each object state of a block: its node id, or -1 without a carrier.
+        """Return the carrier of each object state in a block, as node id; -1 without a carrier.
 
         Parameters
         ----------
@@ -104,7 +104,7 @@ class Hitches:
         return self._parted(bodies, frames, rows, found) if len(rows) else found
 
     def _meet(self, bodies: Callable[[Rows], Bodies], rows: Rows, node: Ints) -> None:
-        """Find carriers among the objects that touch in the first frame in which both exist."""
+        """Find carriers: objects that touch a possible load in the first frame that has both."""
         of = bodies(rows)
         first = _first(of.node, of.frame, len(self._seen))
         first[self._seen] = -1
@@ -119,7 +119,7 @@ class Hitches:
             self._carrier[of.node[one[order]]] = of.node[other[order]]
 
     def _fits(self, of: Bodies, one: Rows, other: Rows) -> Bools:
-        """Return a mask of object pairs in which the second object can carry the first."""
+        """Return a mask of the object pairs whose second object can carry the first."""
         dx, dy = of.x[other] - of.x[one], of.y[other] - of.y[one]
         ahead, _ = offsets(dx, dy, of.heading[one])
         pulled = (of.kind[one] == _TRAILER) & IS_VEHICLE[of.kind[other]] & (ahead > 0)
@@ -133,7 +133,7 @@ class Hitches:
     def _parted(
         self, bodies: Callable[[Rows], Bodies], frames: FrameBlock, rows: Rows, carrier: Ints
     ) -> Ints:
-        """Return the carriers in a block of frames, without those that move apart in the block."""
+        """Return the carriers in a block of frames. A pair that moves apart has no carrier after that."""
         states, frame = frames.states, frames.frame_of
         a, b = _carried(frame, states.node, rows, carrier[rows])
         parted = gap(bodies(a).boxes, bodies(b).boxes) > APART
@@ -146,7 +146,7 @@ class Hitches:
 
 
 def new_frames(frames: FrameBlock, new: Bools) -> Bools:
-    """Return a mask of the object states in frames with a new object."""
+    """Return a mask of the object states in frames in which a new object occurs."""
     first = _first(frames.states.node[new], frames.frame_of[new], int(frames.states.node.max()) + 1)
     wanted = np.zeros(len(frames), np.bool_)
     wanted[first[first >= 0]] = True
@@ -154,7 +154,7 @@ def new_frames(frames: FrameBlock, new: Bools) -> Bools:
 
 
 def _first(node: Ints, frame: Ints, count: int) -> Ints:
-    """Return the first frame of each node, (count,); -1 for an absent node."""
+    """Return the first frame of each node, (count,); -1 for a node that does not occur."""
     first = np.full(count, -1)
     order = np.lexsort((-frame, node))
     first[node[order]] = frame[order]

@@ -1,4 +1,4 @@
-"""Graph of lanes with their successors, and positions along the centre lines of lanes."""
+"""Graph of the lanes of a map and their successors, and positions along the centre lines of lanes."""
 
 from __future__ import annotations
 
@@ -57,13 +57,13 @@ class LaneNet:
         self._from = np.searchsorted(dst[order], np.arange(count + 1))
 
     def onward(self, lane: Ints) -> tuple[Rows, Ints]:
-        """Return the successors of lanes as pairs: query row, successor lane."""
+        """Return the successors of lanes as pairs: index of the query, successor lane."""
         first = self._first[lane]
         owner, index = spread(first, self._first[lane + 1] - first)
         return owner, self._next[index]
 
     def upstream(self, lane: int, along: float, limit: float) -> Ints:
-        """Return the given lane, and all lanes that end at most ``limit`` metres before the position on it."""
+        """Return the given lane, and lanes before it that end within ``limit`` metres of a position on it."""
         nearest: dict[int, float] = {lane: 0.0}
         queue, settled = [(along, lane)], set[int]()
         while queue:
@@ -83,7 +83,7 @@ RUN: Final = 8
 
 
 class Centrelines:
-    """Centre lines of all lanes, for look-ups of positions along lanes.
+    """Centre lines of all lanes, to find positions along lanes.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ class Centrelines:
         np.maximum.at(self._radius, run, far)
 
     def along(self, lane: Ints, x: Floats, y: Floats) -> Floats:
-        """Return the length along each lane's centre line to the point nearest to a position; m.
+        """Return the length along each lane's centre line to the point nearest to a given position; m.
 
         Parameters
         ----------
@@ -160,7 +160,7 @@ class Centrelines:
         return before + np.where(out, onward, share[at]) * (after - before)
 
     def _near(self, lane: Ints, x: Floats, y: Floats) -> tuple[Rows, Rows]:
-        """Return pairs of a position and a piece of its lane that may be the nearest piece."""
+        """Return pairs of a position and a piece of its lane's centre line that may be the nearest piece."""
         first, count = self._first_run[lane], self._runs[lane]
         owner, run = spread(first, count)
         away = np.hypot(

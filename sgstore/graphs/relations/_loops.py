@@ -36,7 +36,7 @@ def near_pairs(
     limit: float,
     found: tuple[Ints, Ints],
 ) -> tuple[int, int]:
-    """Write near object pairs into an array; return their number, and where to continue.
+    """Write pairs of near objects into an array. Return their number, and the position for the next call.
 
     ``order`` has the rows by frame and ``x``, ``end`` has the end of its frame for each place.
     Returns the number of pairs, and the place where the room may have run out.
@@ -68,7 +68,7 @@ def rungs(
     codes: Codes,
     columns: Columns,
 ) -> int:
-    """Write the proximity edges of object pairs in both directions, and return their number.
+    """Write the proximity edges of object pairs in both directions into arrays. Return their number.
 
     ``wanted``: mask of pairs; empty means all pairs.
     """
@@ -104,7 +104,7 @@ def sectors(
     columns: Columns,
     doubtful: Ints,
 ) -> tuple[int, int]:
-    """Write the direction edges of object pairs, and the pairs that need an exact angle; return both counts.
+    """Write the direction edges of object pairs. Return their number, and that of pairs needing an exact angle.
 
     ``bounds`` are sines and cosines. Pairs from ``len(a)`` on are mirror images.
     """
@@ -145,7 +145,7 @@ def sides(
     columns: Columns,
     doubtful: Ints,
 ) -> tuple[int, int]:
-    """Write the left and right edges of object pairs, and return their number."""
+    """Write the left and right edges of object pairs into arrays. Return their number."""
     a, b, (frame, node), (x, y, _), (cos, sin) = pairs
     of, relation, src, dst = columns
     at, unsure = 0, 0
@@ -176,7 +176,7 @@ def along(
     pieces: Ints,
     line: tuple[Floats, Floats, Floats, Floats, Floats, Floats],
 ) -> Floats:
-    """Return the lengths along lane centre lines to the points nearest to given positions; m."""
+    """Return the length along a lane's centre line to the point nearest to each given position; m."""
     at_x, at_y, run_x, run_y, squared, length = line
     found = np.empty(len(lane))
     for i in range(len(lane)):
@@ -260,7 +260,7 @@ def _views(
     bodies: Seen,
     graze: float,
 ) -> tuple[Ints, Floats, Floats, Floats, Bools]:
-    """Return objects relative to the ego's eye: rows, points, boxes, and a mask of opaque objects.
+    """Return objects as seen from the ego's eye: rows, points, boxes, and a mask of opaque objects.
 
     A box is ``cos, sin``, half of length and width, height of points, lower and upper side, and a
     radius.
@@ -302,7 +302,7 @@ def _views(
 
 @compiled
 def _blocked(x: float, y: float, box: Floats, to_x: float, to_y: float, height: float) -> bool:
-    """Return True if a box blocks the sight line to a point."""
+    """Return True if a box blocks the line of sight to a point."""
     cos, sin = box[0], box[1]
     enters, leaves = 0.0, 1.0
     start_x, run_x = -x * cos - y * sin, to_x * cos + to_y * sin

@@ -1,4 +1,4 @@
-"""Look-ups in the road map for the graph generator: map parts below objects, and map parts in graphs.
+"""Look-ups in the road map for the scene graph generator: map parts below objects and in graphs.
 
 The look-up of lanes under a footprint is the most expensive query. Therefore it runs only for
 footprints that have moved: traffic often waits, parks or queues, and scenery never moves.
@@ -116,7 +116,7 @@ class LaneContact:
         self._affects: tuple[Ints, Ints] = (none, none)
 
     def learn(self, entities: Entities, scenery: States) -> None:
-        """Record new objects and the poses of static ones, in order of node id."""
+        """Record new objects, and the poses of static objects, in order of node id."""
         places = dict(
             zip(scenery.node.tolist(), zip(scenery.x, scenery.y, strict=True), strict=True)
         )
@@ -139,7 +139,7 @@ class LaneContact:
         self._affects = _appended(self._affects, affects)
 
     def _column(self, key: tuple[bool, str], place: tuple[float, float]) -> int | None:
-        """Return the map node that an object refers to (such as a traffic light), or ``None``."""
+        """Return the map node to which an object refers, such as a traffic light; ``None`` if not found."""
         columns = self._columns.get(key, [])
         if len(columns) < 2:
             return columns[0] if columns else None
@@ -172,7 +172,7 @@ class LaneContact:
         return Standing(hits, along, own, parts, off_road, unsure)
 
     def ground(self, bodies: Bodies, standing: Standing, areas: Areas, kept: Bools) -> MapContext:
-        """Return the map parts below objects, and those in range of the egos.
+        """Return the map parts below objects, and the map parts in range of the egos.
 
         Parameters
         ----------
@@ -199,7 +199,7 @@ class LaneContact:
         )
 
     def present(self, bodies: Bodies, standing: Standing, areas: Areas, kept: Bools) -> Bools:
-        """Return a mask (F, K) of the map nodes in the graph of each frame.
+        """Return a mask (F, K) of the map nodes that each frame's graph contains.
 
         A lane or crosswalk under a body is present even if it begins just out of range; so are its
         road and junction. ``off_road`` is present if a body is in it. A signal or object of the map
@@ -221,7 +221,7 @@ class LaneContact:
 
 
 def driven(hits: LaneHits, lane: Ints, same: Ints) -> tuple[LaneHits, Bools]:
-    """Return the touched lanes with the driven lane as primary lane, and a mask of the certain choices.
+    """Return touched lanes with the driven lane as primary lane, and a mask of the certain rows.
 
     ``same`` is the first section of the same lane, as a column, for each map node. A driven lane
     that the footprint does not touch does not count, unless it touches another section.
@@ -258,7 +258,7 @@ class _Footing:
         self._lanes, self._crosswalks = self._ask(np.zeros(0, np.intp), self._box)
 
     def of(self, bodies: Bodies) -> tuple[LaneHits, Floats, tuple[Ints, Ints]]:
-        """Return the lanes that objects touch, the positions along them, and the crosswalks below objects."""
+        """Return the lanes that objects touch, their positions along these lanes, and crosswalks below them."""
         rows = np.flatnonzero(~IS_SIGNAL[bodies.kind])
         known = len(self._node)
         node = np.concatenate([self._node, bodies.node[rows]])
@@ -297,7 +297,7 @@ class _Footing:
 
 
 def _runs(node: Ints, frame: Ints, box: Floats) -> tuple[Rows, Rows]:
-    """Return for each row the first row with the same unchanged box, and the last row of each node."""
+    """Return, for each row, the first row since which its box is unchanged, and the last row of each node."""
     order = np.lexsort((frame, node))
     node, bits = (
         node[order],
@@ -314,6 +314,6 @@ def _runs(node: Ints, frame: Ints, box: Floats) -> tuple[Rows, Rows]:
 
 
 def _looked_up(table: Table, wanted: Rows) -> Table:
-    """Return the table rows of the wanted objects."""
+    """Return the table rows that belong to the wanted objects."""
     owner, index = joined(table[0], wanted)
     return (owner, *(column[index] for column in table[1:]))

@@ -1,4 +1,4 @@
-"""Pairs of objects that can have relations, computed with bounded memory.
+"""Pairs of objects that can have relations, computed with limited memory.
 
 This module finds related bodies, and computes the numbers that the relations need.
 """
@@ -46,7 +46,7 @@ NO_PAIRS: Final[Halves] = (np.zeros(0, np.intp), np.zeros(0, np.intp))
 
 
 def near_pairs(bodies: Bodies, config: Config, unwanted: Bools) -> Iterator[Halves]:
-    """Yield the pairs of moving objects that are near each other in a frame, without traffic signals.
+    """Yield pairs of moving objects that are near each other in a frame. Traffic signals are left out.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def near_pairs(bodies: Bodies, config: Config, unwanted: Bools) -> Iterator[Halv
 
 
 def pairs_among(bodies: Bodies, rows: Rows, config: Config, unwanted: Bools) -> Iterator[Halves]:
-    """Yield the near pairs among some objects, moving or not."""
+    """Yield the pairs of near objects among the given ones, whether they move or not."""
     within, between = config.pairs.within, config.proximity.between
     if within > 0 and between != "footprints" and worth():
         yield from _near_in_loops(bodies, rows, within, between, unwanted)
@@ -74,7 +74,7 @@ def pairs_among(bodies: Bodies, rows: Rows, config: Config, unwanted: Bools) -> 
 
 
 def related_pairs(bodies: Bodies, ego: Rows, near: Halves, config: Config) -> BodyPairs:
-    """Return all pairs that can have relations: the ego with every object, and near objects.
+    """Return all pairs that can have relations: the ego with each other object, and pairs of near objects.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def related_pairs(bodies: Bodies, ego: Rows, near: Halves, config: Config) -> Bo
 
 
 def _behind(pairs: Halves, others: Halves, rows: Rows) -> Halves:
-    """Append the given rows of a second list of object pairs to the first list."""
+    """Append some rows of a second list of object pairs to the first list."""
     count = len(pairs[0])
     a, b = np.empty((2, count + len(rows)), np.intp)
     for column, first, rest in zip((a, b), pairs, others, strict=True):
@@ -119,7 +119,7 @@ def _behind(pairs: Halves, others: Halves, rows: Rows) -> Halves:
 def of_kinds(
     bodies: Bodies, ego: Rows, pairs: Halves, kinds: tuple[tuple[str, ...], ...]
 ) -> Halves:
-    """Return the object pairs of listed kinds, in either order; all pairs for an empty list."""
+    """Return the object pairs with two listed kinds, in either order. An empty list allows all pairs."""
     if not kinds:
         return pairs
     a, b = pairs
@@ -130,7 +130,7 @@ def of_kinds(
 def are_of_kinds(
     bodies: Bodies, ego: Rows, pairs: Halves, kinds: tuple[tuple[str, ...], ...]
 ) -> Bools:
-    """Return a mask of the object pairs of listed kinds, in either order."""
+    """Return a mask of the object pairs with two listed kinds, in either order."""
     listed = np.zeros((len(KINDS) + 1, len(KINDS) + 1), np.bool_)  # the last row is the ego
     for one, other in kinds:
         listed[np.ix_(_kind_codes(one), _kind_codes(other))] = True
@@ -156,7 +156,7 @@ def joined_pairs(halves: list[Halves]) -> Halves:
 def _near_pairs(
     bodies: Bodies, rows: Rows, within: float, between: str, unwanted: Bools
 ) -> Iterator[tuple[Rows, Rows]]:
-    """Yield the pairs of some objects within a distance of each other, in the same frame.
+    """Yield the pairs of given objects that are within a distance of each other in the same frame.
 
     The rows are sorted by frame and by strips across the x axis. The candidates of a row are the
     later rows in its own strip and in the next few strips: a range of the sorted rows.
@@ -187,7 +187,7 @@ def _near_pairs(
 def _near_in_loops(
     bodies: Bodies, rows: Rows, within: float, between: str, unwanted: Bools
 ) -> Iterator[Halves]:
-    """Yield the same object pairs as :func:`_near_pairs`, in another order, with compiled loops."""
+    """Yield the same object pairs as :func:`_near_pairs` with compiled loops, in another order."""
     from sgstore.graphs.relations import _loops
 
     rows = rows[np.isfinite(bodies.x[rows])]
@@ -218,7 +218,7 @@ MOST_LEARNT: Final = 1 << 22
 
 
 class StillPairs:
-    """Near pairs of static objects of a trace; empty unless the settings request them.
+    """Pairs of near static objects in a trace. Empty unless the settings request them.
 
     Parameters
     ----------
@@ -236,7 +236,7 @@ class StillPairs:
         return self._config.pairs.static and self._config.pairs.within > 0
 
     def learn(self, scenery: Bodies) -> None:
-        """Find the near pairs of all static objects so far, unless they are too many."""
+        """Find the pairs of near objects among all static objects so far, unless there are too many."""
         rows = np.arange(len(scenery))
         (a, b), over = gathered(
             lambda unwanted: pairs_among(scenery, rows, self._config, unwanted),
@@ -251,7 +251,7 @@ class StillPairs:
     def among(
         self, bodies: Bodies, keys: Ints, states: int, count: int, unwanted: Bools
     ) -> Iterator[tuple[Rows, Rows]]:
-        """Yield the near pairs of static objects in which both are in range of the ego.
+        """Yield the pairs of near static objects if both are in range of the ego.
 
         Parameters
         ----------
@@ -306,7 +306,7 @@ AT_ONCE: Final = 1 << 18
 def gathered(
     chunks: Callable[[Bools], Iterable[Halves]], frame: Ints, frames: int, most: int | None = None
 ) -> tuple[Halves, Bools]:
-    """Collect object pairs of frames. Frames with too many pairs are left out.
+    """Collect the object pairs of all frames. Leave out frames with too many pairs.
 
     Parameters
     ----------

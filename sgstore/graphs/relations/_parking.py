@@ -1,4 +1,4 @@
-"""Detection of parked vehicles, after a whole trace is read."""
+"""Detection of parked vehicles after the last frame of a trace."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ NEVER: Final = np.iinfo(np.int64).min
 
 
 class Parking:
-    """Record of the vehicles of a trace that detects parked ones. Memory grows with vehicles, not time.
+    """Detector of parked vehicles in a trace. Its memory grows with the vehicles, not with time.
 
     A vehicle is parked if the simulator marks it as static. It is also parked if it does not move
     in the whole trace and a lane for driving is never its primary lane. Without a map, it must be
@@ -66,7 +66,7 @@ class Parking:
         self._last: Floats = np.zeros((0, 2))
 
     def learn(self, entities: Entities) -> None:
-        """Record the new objects of a block of frames, to detect parked vehicles later."""
+        """Record the new objects of a block of frames, as candidates for parked vehicles."""
         no: Bools = np.zeros(len(entities), np.bool_)
         self._vehicle = np.append(self._vehicle, IS_VEHICLE[entities.kind])
         self._static = np.append(self._static, entities.static)
@@ -116,12 +116,12 @@ class Parking:
 
     @property
     def parked(self) -> Codes:
-        """Parked state of each object in graphs: 1 parked, 0 not, -1 unknown or no vehicle."""
+        """Parking state of each object in the graphs: 1 parked, 0 not parked, -1 unknown or no vehicle."""
         return self._parked(0)
 
     @property
     def world_parked(self) -> Codes:
-        """Parked state of each object, from its states inside and outside the graphs."""
+        """Parking state of each object. States outside the graphs also count."""
         return self._parked(1)
 
     def _parked(self, row: int) -> Codes:

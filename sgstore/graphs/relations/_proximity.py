@@ -1,4 +1,4 @@
-"""Proximity relations of object pairs, such as ``near``: at most one of several distance ranges holds.
+"""Proximity relations of object pairs, such as ``near``. Each has a distance range; at most one holds.
 
 The distance is between the centres of the boxes, in space; in the plane if a height is unknown.
 There is no relation between storeys, to a flat body, or between a carried body and its carrier.

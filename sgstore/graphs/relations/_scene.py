@@ -47,7 +47,7 @@ _ROUNDING: Final = 1e-15
 
 
 def meeting(group: Ints, low: Floats, high: Floats) -> Iterator[tuple[Rows, Rows]]:
-    """Yield the pairs of overlapping intervals in the same group, and some that almost overlap.
+    """Yield the pairs of intervals in the same group that overlap, or almost overlap.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def meeting(group: Ints, low: Floats, high: Floats) -> Iterator[tuple[Rows, Rows
 
 
 def parts(count: Ints) -> Iterator[slice]:
-    """Yield consecutive slices of an array of counts, each with about :data:`CHUNK` items in total."""
+    """Split an array of counts into slices, each with a sum of about :data:`CHUNK`. Yield the slices."""
     total = np.cumsum(count)
     bounds = np.searchsorted(total, np.arange(CHUNK, int(total[-1]), CHUNK)) if len(total) else []
     for begin, end in zip([0, *bounds], [*bounds, len(count)], strict=True):
@@ -141,7 +141,7 @@ class Bodies:
 
     @property
     def bottom(self) -> Floats:
-        """Height of the lower side of each object, (N,); m. Without a known height it is ``z``."""
+        """Height of the lower side of each object, (N,); m. It is ``z`` if the object's height is unknown."""
         return self.z - np.nan_to_num(self.height) / 2
 
     @property
@@ -156,7 +156,7 @@ class Bodies:
 
 
 class BodyPairs:
-    """Ordered pairs (a, b) of objects that can have relations. The second half has the same pairs as (b, a).
+    """Ordered pairs (a, b) of objects that can have relations. The second half repeats them as (b, a).
 
     Parameters
     ----------
@@ -186,7 +186,7 @@ class BodyPairs:
 
     @cached_property
     def span(self) -> Floats:
-        """Comparable distances (such as squares) of the first half of the pairs, (K / 2,)."""
+        """Distances of the first half of the pairs, (K / 2,). For speed, they may be squares."""
         half = self._half
         found = np.empty(half)
         for part in even_parts(half):
@@ -197,7 +197,7 @@ class BodyPairs:
 
     @cached_property
     def distance(self) -> Floats:
-        """Distance of each object pair, as defined by the settings; m."""
+        """Distance of each object pair, measured as the settings define; m."""
         distance = self.span if self._between == "footprints" else np.sqrt(self.span)
         return np.concatenate([distance, distance])
 
@@ -219,7 +219,7 @@ class BodyPairs:
 
     @cached_property
     def offsets(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Distance of b ahead of a, and to the left of a; m. The error is below 1e-6 of the distance.
+        """How far b is ahead of a, and to the left of a; m. The error is below 1e-6 of the distance.
 
         NaN without a's heading, or with a heading beyond :data:`MOST_TURNED`.
         """
@@ -240,7 +240,7 @@ class BodyPairs:
 
     @cached_property
     def for_loops(self) -> Looped:
-        """Arrays of the pairs for compiled loops: rows, frames, nodes, positions and headings."""
+        """The pairs as arrays for compiled loops: rows, frames, nodes, positions and headings."""
         of = self._bodies
         return (
             *self._halves,
@@ -251,7 +251,7 @@ class BodyPairs:
 
     @cached_property
     def of_bodies(self) -> Bools:
-        """Mask (K / 2,) of the pairs of two solid objects on the same storey. An empty mask means all pairs."""
+        """Mask (K / 2,) of pairs of two solid objects on the same storey. It is empty if all pairs are such."""
         of = self._bodies
         plain = not (of.carrier >= 0).any() and not (of.height == 0).any()
         levels = of.low_and_high
@@ -261,7 +261,7 @@ class BodyPairs:
 
     @property
     def in_loops(self) -> bool:
-        """True if compiled loops can process the pairs; they do not support footprints."""
+        """True if compiled loops can process the pairs. They do not support distances of footprints."""
         return self._between != "footprints" and worth()
 
     @cached_property
@@ -272,7 +272,7 @@ class BodyPairs:
 
     @cached_property
     def ends(self) -> tuple[Nodes, Nodes, Nodes]:
-        """Frames, and node ids of a and b, for each pair; int32."""
+        """Frame of each pair, and the node ids of a and b; int32."""
         frame, node = self._bodies.frame.astype(np.int32), self._bodies.node.astype(np.int32)
         frame, one, other = frame[self._halves[0]], node[self._halves[0]], node[self._halves[1]]
         return (
@@ -290,24 +290,24 @@ EVEN_PART: Final = 1 << 13
 
 
 def by_frame(frame: Ints, frames: int) -> tuple[Rows, Ints]:
-    """Return row numbers sorted by frame, and the start of each frame in them."""
+    """Return row numbers sorted by frame, and the index at which each frame begins."""
     order = np.argsort(frame, kind="stable")
     return order, np.searchsorted(frame[order], np.arange(frames + 1))
 
 
 def turns(bodies: Bodies) -> tuple[Floats, Floats]:
-    """Return the cosines and sines of the headings of objects."""
+    """Return the cosine and sine of each object's heading."""
     return np.cos(bodies.heading), np.sin(bodies.heading)
 
 
 def even_parts(count: int) -> Iterator[slice]:
-    """Yield slices that split ``count`` rows into parts of :data:`EVEN_PART` rows."""
+    """Yield slices that together cover ``count`` rows, each with at most :data:`EVEN_PART` rows."""
     for start in range(0, count, EVEN_PART):
         yield slice(start, min(start + EVEN_PART, count))
 
 
 def distances(bodies: Bodies, a: Rows, b: Rows, between: str) -> Floats:
-    """Return the distances of object pairs, by centres or by footprints as in the settings; m.
+    """Return the distances of object pairs, between centres or footprints as the settings define; m.
 
     The origin of a moving vehicle is on the ground, that of other bodies in the centre of the box,
     as in CARLA. A footprint without extent or heading is a point.
@@ -317,7 +317,7 @@ def distances(bodies: Bodies, a: Rows, b: Rows, between: str) -> Floats:
 
 
 def spans(bodies: Bodies, a: Rows, b: Rows, between: str) -> Floats:
-    """Return values that sort like the distances of object pairs: squares, or gaps of footprints."""
+    """Return numbers with the same order as the distances of object pairs: squares, or gaps of footprints."""
     if between == "footprints":
         boxes = bodies.boxes
         boxes[np.isnan(boxes).any(axis=1), 2:] = 0
@@ -329,7 +329,7 @@ def spans(bodies: Bodies, a: Rows, b: Rows, between: str) -> Floats:
 
 
 def heights_meet(bodies: Bodies, a: Rows, b: Rows) -> Bools:
-    """Return a mask of the object pairs that overlap in height; True if a height is unknown."""
+    """Return a mask of the object pairs whose height ranges overlap. True if a height is unknown."""
     low, high = bodies.low_and_high
     reach = np.fmax(low[b] - high[a], low[a] - high[b])
     solid = high > low
@@ -337,7 +337,7 @@ def heights_meet(bodies: Bodies, a: Rows, b: Rows) -> Bools:
 
 
 def on_one_level(bodies: Bodies, a: Rows, b: Rows) -> Bools:
-    """Return a mask of the object pairs on the same storey; True if it is unknown.
+    """Return a mask of the object pairs on the same storey. True if a height is unknown.
 
     Two bodies are on one storey if they overlap in height, or if a climbing road can join them.
     """
@@ -357,14 +357,14 @@ def solid_pairs(bodies: Bodies, a: Rows, b: Rows) -> Bools:
 
 
 def carried_by(bodies: Bodies, a: Rows, b: Rows) -> Bools:
-    """Return a mask of the object pairs with a carrier and its load, or with a common carrier."""
+    """Return a mask of the object pairs that are a carrier and its load, or loads of the same carrier."""
     carrier, node = bodies.carrier, bodies.node
     bound = (carrier[a] == node[b]) | (carrier[b] == node[a])
     return bound | (carrier[a] >= 0) & (carrier[a] == carrier[b])
 
 
 def levels(bodies: Bodies, between: str) -> Floats:
-    """Return the height of each object, which distances use; m."""
+    """Return the height of the point of each object from which distances are measured; m."""
     if between != "origins":
         return bodies.z
     on_ground: Bools = bodies.moves & IS_VEHICLE[bodies.kind]
@@ -372,7 +372,7 @@ def levels(bodies: Bodies, between: str) -> Floats:
 
 
 def span_up_to(distance: float, between: str) -> float:
-    """Return the greatest comparable distance (such as a square) for a distance limit."""
+    """Convert a distance limit to a limit for the result of :func:`spans`, such as its square."""
     if between == "footprints":
         return distance
     span = distance * distance
@@ -385,7 +385,7 @@ def span_up_to(distance: float, between: str) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """Map parts (lanes, crosswalks) below the objects of a block, independent of the ego.
+    """Map parts (lanes, crosswalks) below the objects of a block. They are the same for all egos.
 
     Attributes
     ----------
@@ -413,7 +413,7 @@ class Standing:
     unsure: NDArray[np.intp]
 
     def take(self, place: NDArray[np.intp]) -> Standing:
-        """Return the map parts below selected objects. The objects get new row numbers."""
+        """Return the map parts below some objects. The row numbers of the objects change."""
         hits, (rows, nodes) = self.hits, self.parts
         kept, there = place[hits.row] >= 0, place[rows] >= 0
         hits = taken(hits, kept)
@@ -463,7 +463,7 @@ def _columns_of(count: int) -> Columns:
 
 
 class EdgeRoom:
-    """Preallocated arrays for the edges of a block of frames. All relations write into them.
+    """Memory for the edges of a block of frames. All relations write into the same arrays.
 
     Therefore edges are written once. A family can also return its own columns, which are copied at
     the end.
@@ -480,7 +480,7 @@ class EdgeRoom:
         self._used = 0
 
     def rest(self, count: int) -> Columns:
-        """Return arrays with space for at least ``count`` more edges."""
+        """Return arrays with space for ``count`` or more edges."""
         if self._used + count > len(self._columns[0]):
             return _columns_of(count)
         frame, relation, src, dst = self._columns
@@ -488,7 +488,7 @@ class EdgeRoom:
         return frame[first:], relation[first:], src[first:], dst[first:]
 
     def filled(self, columns: Columns, count: int, more: Edges | None = None) -> Edges:
-        """Return the written part of the arrays as edges. ``more`` edges are appended to it."""
+        """Return the first ``count`` edges in the arrays as a table, with ``more`` edges appended."""
         if more is not None and len(more):
             if count + len(more) > len(columns[0]):
                 return Edges.chained([self.filled(columns, count), more])
@@ -501,7 +501,7 @@ class EdgeRoom:
         return edges
 
     def chained(self, parts: Sequence[Edges]) -> Edges:
-        """Concatenate edges. Edges that already lie in the preallocated arrays are not copied."""
+        """Concatenate tables of edges. Edges that are already in these arrays are not copied."""
         others = [part for part in parts if not any(part is own for own in self._parts)]
         count = self._used + sum(map(len, others))
         if len(parts) - len(others) < len(self._parts) or count > len(self._columns[0]):
@@ -527,7 +527,7 @@ def _fill(columns: Columns, first: int, edges: Edges) -> None:
 
 @dataclass(frozen=True, slots=True)
 class BlockScene:
-    """Frames of a block with objects, object pairs, contacts and map parts, for all relations.
+    """Frames of a block with objects, object pairs, contacts and map parts: the input of all relations.
 
     Attributes
     ----------
@@ -553,12 +553,12 @@ class BlockScene:
     room: EdgeRoom = field(default_factory=EdgeRoom)
 
     def parameters(self, relation: Relation) -> Mapping[str, Any]:
-        """Return the parameters of a relation: those of the settings, and defaults for the others."""
+        """Return the parameters of a relation from the settings, with defaults for missing values."""
         return {**relation.parameters, **self.config.relations.get(relation.name, {})}
 
 
 def always(config: Config) -> bool:
-    """Return True: the relation is part of the graphs under all settings."""
+    """Return True, for a relation that belongs to the graphs under all settings."""
     return True
 
 
@@ -621,7 +621,7 @@ def relates_pairs(config: Config) -> bool:
 def edges_between(
     scene: BlockScene, relation: str | Codes, src: NDArray[np.intp], dst: NDArray[np.intp]
 ) -> Edges:
-    """Return edges from object to object, given by rows, with one relation or one code each."""
+    """Return edges between objects, given as row numbers. All have one relation, or each has a code."""
     bodies = scene.bodies
     return Edges(
         bodies.frame[src], _relation_codes(relation, len(src)), bodies.node[src], bodies.node[dst]
@@ -631,7 +631,7 @@ def edges_between(
 def edges_of_pairs(
     scene: BlockScene, codes: Codes, holds: Bools, *, seen_by_a: bool = False
 ) -> tuple[Columns, int]:
-    """Return the edges of the object pairs in a mask, with a relation code for each pair.
+    """Return the edges of the object pairs in a mask. Each pair has its own relation code.
 
     Parameters
     ----------
@@ -664,7 +664,7 @@ def edges_of_pairs(
 def edges_to_map(
     scene: BlockScene, relation: str, src: NDArray[np.intp] | Ints, dst: Ints
 ) -> Edges:
-    """Return edges from objects (rows) to map nodes (node ids), with one relation."""
+    """Return edges with one relation, from objects (row numbers) to map nodes (node ids)."""
     bodies = scene.bodies
     return Edges(bodies.frame[src], _relation_codes(relation, len(src)), bodies.node[src], dst)
 
@@ -676,7 +676,7 @@ def _relation_codes(relation: str | Codes, count: int) -> Codes:
 
 
 def kinds_mask(names: tuple[str, ...]) -> Bools:
-    """Return a boolean array, indexed by kind code: True for the named kinds."""
+    """Return an array of truth values indexed by kind code: True for the given kinds."""
     table = np.zeros(MOST_KINDS, np.bool_)
     table[[KIND_CODE[name] for name in names]] = True
     return table
@@ -689,6 +689,6 @@ IS_USER: Final = kinds_mask((*VEHICLES, "person", "animal"))
 
 
 def joined(keys: Ints, wanted: Ints) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return all pairs of equal values in two arrays: rows of ``wanted``, and rows of ``keys``."""
+    """Return all pairs of rows with equal values in two arrays: row of ``wanted``, row of ``keys``."""
     start = np.searchsorted(keys, wanted)
     return spread(start, np.searchsorted(keys, wanted, side="right") - start)

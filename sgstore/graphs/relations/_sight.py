@@ -1,4 +1,4 @@
-"""Relation ``sees``: objects that the ego sees, because no other object hides them.
+"""Relation ``sees``: objects that the ego can see, because no other object hides them.
 
 The eye is above the centre of the ego, at the height of its roof. A body is seen if a straight line
 to its centre, or to a corner of its footprint at that height, is free. A body blocks a line that
@@ -56,7 +56,7 @@ POINTS: Final = 5
 
 
 def seen(bodies: Bodies, ego: Rows) -> Rows:
-    """Return the rows of the objects that the ego of their frame sees.
+    """Return the rows of the objects that the ego can see in their frame.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def _seen_in_loops(bodies: Bodies, ego: Rows) -> Rows:
 
 @dataclass(frozen=True, slots=True)
 class _Views:
-    """Objects relative to the ego's eye, in map axes; shape (N,).
+    """Objects relative to the position of the ego's eye, in map axes; shape (N,).
 
     Attributes
     ----------
@@ -168,7 +168,7 @@ def _views(bodies: Bodies, rows: Rows, eye: Rows) -> _Views:
 
 
 def _in_one_direction(views: _Views, frame: Ints) -> Iterator[tuple[Rows, Rows]]:
-    """Yield pairs of an object and a nearer object in the same direction, which may hide it."""
+    """Yield pairs of an object and an object that may hide it: nearer, and in the same direction."""
     # Ranges beyond π occur a second time, from the other side.
     again = np.flatnonzero(views.high > np.pi)
     rows = np.concatenate([np.arange(len(views.low)), again])
@@ -182,7 +182,7 @@ def _in_one_direction(views: _Views, frame: Ints) -> Iterator[tuple[Rows, Rows]]
 
 
 def _blocked(views: _Views, target: Rows, cover: Rows, point: int) -> Bools:
-    """Return a mask of the sight lines to a point of an object that a nearer object blocks."""
+    """Return a mask of lines of sight, each to a point of an object: True if a nearer object blocks it."""
     cos, sin = views.cos[cover], views.sin[cover]
     x, y = views.x[cover, 0], views.y[cover, 0]
     to_x, to_y = views.x[target, point], views.y[target, point]
@@ -207,7 +207,7 @@ def _blocked(views: _Views, target: Rows, cover: Rows, point: int) -> Bools:
 def _within(
     start: Floats, run: Floats, half: Floats, enters: Floats | float, leaves: Floats | float
 ) -> tuple[Floats, Floats]:
-    """Return the part of a line in which a coordinate is within ±``half``: start and end as fractions."""
+    """Return the fractions of a line at which a coordinate enters and leaves the range ±``half``."""
     with np.errstate(divide="ignore", invalid="ignore"):
         one, other = (-half - start) / run, (half - start) / run
     return (

@@ -59,7 +59,7 @@ class SignalReach:
         return self._upstream(-2 - self._map.lanes_of_signal(signal), *place)
 
     def of_map(self, present: Bools) -> tuple[Ints, Ints]:
-        """Return pairs of node ids: a map signal present in any frame, and a lane that it may affect.
+        """Return pairs of node ids: a map signal that occurs in some frame, and a lane that it may affect.
 
         Parameters
         ----------
@@ -81,7 +81,7 @@ class SignalReach:
         return self._known[column]
 
     def _upstream(self, controlled: Ints, x: float, y: float) -> Ints:
-        """Return node ids of the given lanes and of the lanes that lead to them."""
+        """Return the node ids of the given lanes, and of the lanes that lead to them."""
         places = np.zeros(len(controlled))
         if np.isfinite(x) and np.isfinite(y):
             here = np.ones(len(controlled))

@@ -120,11 +120,11 @@ class Waypoints:
         )
 
     def _inside(self, points: LanePoints) -> tuple[Ints, Ints]:
-        """Return pairs of a waypoint and its lane, as node rows."""
+        """Return pairs of node rows: a waypoint, and its lane."""
         return self._first[0] + np.arange(len(points.lane)), FIRST_LANE + points.lane
 
     def _onward(self, edges: MapEdges) -> tuple[Ints, Ints]:
-        """Return pairs of a waypoint and the next waypoint along the lane, as node rows."""
+        """Return pairs of node rows: a waypoint, and the next waypoint on the lane."""
         total = int(self._counts.sum())
         begin = int(self._first[0]) if len(self._first) else 0
         column = begin + np.arange(total)
@@ -139,7 +139,7 @@ class Waypoints:
         )
 
     def of(self, hits: LaneHits, along: Floats, bodies: Bodies) -> tuple[Ints, Ints]:
-        """Return pairs of an object row and the node id of a waypoint below the object, sorted by object.
+        """Return pairs of an object and a waypoint below it: object row, node id of the waypoint.
 
         Parameters
         ----------
@@ -163,7 +163,7 @@ class Waypoints:
 
 
 def _markings(road_map: RoadMap, points: LanePoints) -> dict[int, dict[str, Any]]:
-    """Return the attributes of the markings at waypoints, by node row."""
+    """Return the attributes of lane markings at waypoints: node row → attributes."""
     found: dict[int, dict[str, Any]] = {}
     for row, sides in road_map.marking_parts.items():
         low, high = np.searchsorted(points.lane, (row - FIRST_LANE, row - FIRST_LANE + 1)).tolist()
