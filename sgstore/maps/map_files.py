@@ -1,4 +1,4 @@
-"""Choice of the road map for a recording: its own map, a given file, or a file of a folder by name."""
+"""Choice of the road map for a recording: its OpenDRIVE map, a given file, or a file with the map's name."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def read_map_file(path: str | Path, signs: Signs = SIGNS) -> RoadMap:
 
 
 def _unpacked(path: Path) -> bytes:
-    """Return the bytes of a file, decompressed if it is gzip, like some SUMO networks."""
+    """Return the bytes of a file. If it is gzip, as some SUMO networks are, decompress it."""
     content = path.read_bytes()
     if content[:2] != b"\x1f\x8b":
         return content
@@ -115,7 +115,7 @@ def _projection(path: Path) -> Projection | None:
 
 
 def _decoded(content: bytes) -> str:
-    """Decode an XML file with its declared encoding, else UTF-8."""
+    """Decode an XML file with its declared encoding, or else as UTF-8."""
     named = _ENCODING.match(content)
     if named and content[:2] not in {b"\xff\xfe", b"\xfe\xff"}:
         return content.decode(named[1].decode())
@@ -156,11 +156,11 @@ class Maps:
 
     @property
     def digest(self) -> str:
-        """Digest of the map file that the caller has chosen. Empty without a file."""
+        """Digest of the map file that the caller has chosen; empty if no file was chosen."""
         return self._given.digest if self._given is not None else ""
 
     def of(self, info: TraceInfo) -> tuple[RoadMap | None, list[str]]:
-        """Return the road map for a recording, and warnings about the choice.
+        """Return the road map for a recording, and warnings about how it was chosen.
 
         Its own OpenDRIVE has priority, then the map of the caller, then plain lanes of the
         recording.
@@ -193,7 +193,7 @@ class Maps:
         return self._read[text]
 
     def _named(self, name: str, warnings: list[str]) -> RoadMap | None:
-        """Return the map in a file of a folder, by the map's name: ``Carla/Maps/Town01`` is ``Town01.xodr``."""
+        """Return the map from the file of that name in the folder: ``Carla/Maps/Town01`` is ``Town01.xodr``."""
         if self.folder is None:
             return None
         stem = PurePosixPath(name.replace("\\", "/")).name.removesuffix(OF_LANES)
@@ -221,7 +221,7 @@ class Maps:
 
 
 def lost_lanes(info: TraceInfo, road_map: RoadMap | None) -> list[Loss]:
-    """Return reports of the unusable lanes of a recording's map, unless another map replaces it."""
+    """Return a report entry for each unusable lane of the recording's map; empty if another map is used."""
     if road_map is not None and road_map.text != info.map_text:
         return []
     return [Loss(reason, 0, 0) for reason in info.lost_lanes]

@@ -1,4 +1,4 @@
-"""Reader of SUMO networks (``.net.xml``), which converts them to the lane text format of sgstore.
+"""Reader of SUMO networks (``.net.xml``). It converts them to the lane text format of sgstore.
 
 A lane is a line with a width; lane 0 of an edge is its rightmost. Lanes inside a junction
 (``:J0_1_0``) are lanes of that junction. Crossings become crosswalks; walking areas are skipped.
@@ -170,7 +170,7 @@ def _lines(net: _SumoNet, notes: list[str]) -> tuple[dict[str, LaneLine], list[P
 
 
 def _fault(ident: str, centre: Floats, width: float, lines: dict[str, LaneLine]) -> str:
-    """Return the reason why a SUMO lane is left out, or an empty text if it is valid."""
+    """Return the reason to leave out a SUMO lane; empty if the lane is valid."""
     if not ident or len(ident) > MAX_NAME or len(centre) < 2:
         return "left out, because its shape is not a line"
     if not 0 < width < 1000:
@@ -185,7 +185,7 @@ def _lane_line(
     sections: Sections,
     roundabouts: dict[tuple[str, str], str],
 ) -> LaneLine:
-    """Return a SUMO lane without neighbours and links."""
+    """Return a SUMO lane. Its neighbours and links are added later."""
     in_junction = edge.ident.startswith(":")
     junction = edge.ident[1:].rpartition("_")[0] if in_junction else ""
     return LaneLine(
@@ -204,7 +204,7 @@ def _lane_line(
 
 
 def _roundabouts(net: _SumoNet) -> dict[tuple[str, str], str]:
-    """Return the name of the roundabout for each SUMO node and edge in a roundabout."""
+    """Return the roundabout of each SUMO node and edge that belongs to one: id → name."""
     names: dict[tuple[str, str], str] = {}
     for roundabout in net.roundabouts:
         nodes = roundabout.get("nodes", "").split()
@@ -221,13 +221,13 @@ def _crosswalk(ident: str, sections: Sections) -> PlainCrosswalk:
 
 
 def _side(sections: Sections, *, left: bool) -> Border:
-    """Return a lane border that allows lane changes in both directions, as on SUMO edges."""
+    """Return a lane border that vehicles may cross in both directions, as on SUMO edges."""
     line = sections.left if left else sections.right
     return Border(np.column_stack((line, sections.z)), to_left=True, to_right=True)
 
 
 def _add_neighbours(net: _SumoNet, edge: _SumoEdge, lines: dict[str, LaneLine]) -> None:
-    """Add the neighbours of the lanes of a SUMO edge. The lane with the next index is on the left."""
+    """Add the left neighbour of each lane of a SUMO edge: the lane with the next index."""
     idents = [lane.get("id", "") for lane in edge.lanes]
     for right, left in pairwise(idents):
         if right in lines and left in lines:
@@ -239,7 +239,7 @@ def _add_neighbours(net: _SumoNet, edge: _SumoEdge, lines: dict[str, LaneLine]) 
 
 
 def _add_opposites(net: _SumoNet, lines: dict[str, LaneLine]) -> None:
-    """Add the leftmost lanes of opposite SUMO edges as neighbours, if they touch."""
+    """If the leftmost lanes of opposite SUMO edges touch, make them neighbours."""
     edges_between: dict[tuple[str, str], list[_SumoEdge]] = defaultdict(list)
     for edge in net.edges:
         if not edge.function and edge.lanes:
@@ -262,7 +262,7 @@ def _side_by_side(one: LaneLine, other: LaneLine) -> bool:
 
 
 def _joined(net: _SumoNet, lines: dict[str, LaneLine], notes: list[str]) -> list[LaneLine]:
-    """Return SUMO lanes with predecessors and successors, also through junctions with internal lanes.
+    """Return SUMO lanes with predecessors and successors added, also those inside junctions.
 
     An inner lane without a connection leads to the end of the connection through it.
     """
@@ -300,7 +300,7 @@ def _to_lane(connection: dict[str, str]) -> str:
 
 
 def _contradictions(net: _SumoNet) -> list[str]:
-    """Return warnings about lengths, traffic lights and roundabouts that contradict the lanes."""
+    """Return warnings about lengths, traffic lights and roundabouts that do not fit the lanes."""
     notes: list[str] = []
     edges = {edge.ident for edge in net.edges}
     for edge in net.edges:
@@ -338,7 +338,7 @@ def _from_lane(connection: dict[str, str]) -> str:
 
 
 def _lights(net: _SumoNet, lines: dict[str, LaneLine], row_of: dict[str, int]) -> list[PlainSignal]:
-    """Return the traffic lights of a SUMO network. Lanes of a junction with equal states share one light."""
+    """Return the traffic lights of a SUMO network. Lanes whose lights always show the same share one light."""
     links: dict[str, dict[tuple[str, ...], dict[int, str]]] = defaultdict(dict)
     for connection in net.connections:
         name, index = connection.get("tl", ""), connection.get("linkIndex", "0")
@@ -359,7 +359,7 @@ def _lights(net: _SumoNet, lines: dict[str, LaneLine], row_of: dict[str, int]) -
 
 
 def _lane_type(lane: dict[str, str]) -> str:
-    """Return the lane type from the vehicle classes that a SUMO lane permits."""
+    """Return the lane type of a SUMO lane, from the vehicle classes that it permits."""
     allowed = {*lane.get("allow", "").split()}
     if not allowed and "all" in lane.get("disallow", "").split():
         return "none"

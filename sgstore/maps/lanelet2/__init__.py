@@ -1,4 +1,4 @@
-"""Reader of Lanelet2 maps (``.osm``), which converts them to the lane text format of sgstore.
+"""Reader of Lanelet2 maps (``.osm``). It converts them to the lane text format of sgstore.
 
 ``_document`` reads the text into points, ways and relations. ``_projection`` converts latitude and
 longitude to metres. ``_lanes`` makes lanes of lanelets, and signals and crosswalks of other

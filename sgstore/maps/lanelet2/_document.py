@@ -37,7 +37,7 @@ class OsmElement:
     place: tuple[str, str] = ("", "")
 
     def members_of(self, role: str, kind: str = "way") -> list[str]:
-        """Return the ids of the members of a relation that have a role, such as ``left``."""
+        """Return the ids of the members that have a given role (such as ``left``) in a relation."""
         return [ref for what, ref, own in self.members if own == role and what == kind]
 
 
@@ -100,7 +100,7 @@ def read_osm(text: str, projection: Projection) -> OsmDocument:
 
 
 def _contradictions(elements: list[OsmElement], document: OsmDocument) -> Iterator[str]:
-    """Yield ids that occur twice, and members of lanelets and rules that are missing."""
+    """Yield ids that occur twice, and missing members of lanelets and rules."""
     for (kind, ident), count in Counter((one.kind, one.ident) for one in elements).items():
         if count > 1:
             yield f"{kind} {ident}: there are {count} of this id; the last one counts"
@@ -114,7 +114,7 @@ def _contradictions(elements: list[OsmElement], document: OsmDocument) -> Iterat
 
 
 def _places(nodes: list[OsmElement], projection: Projection, warnings: list[str]) -> Floats:
-    """Return positions (n, 3) of OpenStreetMap nodes: ``local_x`` and ``local_y``, or projected degrees."""
+    """Return the positions (n, 3) of OpenStreetMap nodes: ``local_x`` and ``local_y``, or projected degrees."""
     if not nodes:
         return np.zeros((0, 3))
     height, x, y = (

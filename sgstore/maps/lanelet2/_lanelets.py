@@ -115,7 +115,7 @@ def read_lanelets(document: OsmDocument) -> dict[str, LaneletShape]:
 
 
 def roundabout_names(document: OsmDocument) -> dict[str, str]:
-    """Return the roundabout of each lanelet that is in a roundabout: lanelet id → roundabout id."""
+    """Return the roundabout of each lanelet that belongs to one: lanelet id → roundabout id."""
     return {
         lanelet: ident[:MAX_NAME]
         for ident, element in document.relations.items()
@@ -126,7 +126,7 @@ def roundabout_names(document: OsmDocument) -> dict[str, str]:
 
 
 def _turned(left: Floats, right: Floats) -> tuple[bool, bool]:
-    """Return True for the left and for the right border if its points run against the lanelet's direction."""
+    """Return two flags, for the left and right border: its points run against the lanelet's direction."""
     along = np.hypot(*(left[[0, -1]] - right[[0, -1]])[:, :2].T).sum()
     across = np.hypot(*(left[[0, -1]] - right[[-1, 0]])[:, :2].T).sum()
     apart = bool(along > across)
@@ -137,7 +137,7 @@ def _turned(left: Floats, right: Floats) -> tuple[bool, bool]:
 
 
 def type_of(element: OsmElement) -> str:
-    """Return the lane type of a lanelet from its subtype; without one, from its permitted participants."""
+    """Return the lane type of a lanelet, from its subtype or else from its permitted participants."""
     subtype = element.tags.get("subtype", "")
     told = {
         key.removeprefix("participant:").partition(":")[0]
@@ -199,7 +199,7 @@ def speed_of(text: str) -> float:
 def with_neighbours(
     document: OsmDocument, lines: Sequence[LaneLine], lanelets: dict[str, LaneletShape]
 ) -> list[LaneLine]:
-    """Return lanes with their left and right neighbours: lanelets that share a border."""
+    """Return the lanes with left and right neighbours added, for lanelets that share a border."""
     users: dict[str, list[tuple[str, bool]]] = defaultdict(list)  # lane, to the left of the way
     for line in lines:
         lanelet = lanelets[line.ident]
@@ -229,7 +229,7 @@ def with_neighbours(
 def with_joints(
     document: OsmDocument, lines: Sequence[LaneLine], lanelets: dict[str, LaneletShape]
 ) -> list[LaneLine]:
-    """Return lanes with their predecessors and successors: lanelets with common end points."""
+    """Return the lanes with predecessors and successors added, for lanelets with common end points."""
     at: dict[tuple[str, str], list[Joint]] = defaultdict(list)
     for line in lines:
         lanelet = lanelets[line.ident]

@@ -89,7 +89,7 @@ _AREAS: Final = {"building": "building", "vegetation": "vegetation", "traffic_is
 
 
 def _areas(document: OsmDocument) -> list[PlainObject]:
-    """Return the areas without traffic (such as buildings) of a Lanelet2 map, as outlines."""
+    """Return areas without traffic (such as buildings) of a Lanelet2 map, each as an outline."""
     found: list[PlainObject] = []
     left: Counter[str] = Counter()
     broken: list[str] = []

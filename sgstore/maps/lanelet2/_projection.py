@@ -114,7 +114,7 @@ class Projection:
         return np.column_stack((x - x0, y - y0, height))
 
     def _corner(self, x: Floats, y: Floats, zone: int) -> tuple[Floats, Floats]:
-        """Return the UTM coordinates of the corner of the MGRS grid square of a map."""
+        """Return the corner of a map's MGRS grid square in UTM coordinates; m."""
         grid = _GRID.fullmatch(self.grid)
         if grid is None:
             return tuple(np.floor(np.mean(v, keepdims=True) / _SQUARE) * _SQUARE for v in (x, y))  # type: ignore[return-value]
@@ -172,7 +172,7 @@ def utm(latitude: Floats, longitude: Floats, zone: int, *, south: bool) -> tuple
 def transverse_mercator(
     latitude: Floats, longitude: Floats, meridian: float, scale: float
 ) -> tuple[Floats, Floats]:
-    """Project latitude and longitude to x and y (n,), from the equator and a meridian; m."""
+    """Project latitude and longitude to x and y (n,), measured from the equator and a meridian; m."""
     sine = np.sin(np.radians(latitude))
     away = np.radians((longitude - meridian + 180) % 360 - 180)
     conformal = np.sinh(np.arctanh(sine) - _E * np.arctanh(_E * sine))

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class Rules:
-    """Traffic rules (regulatory elements) of a Lanelet2 map, with the lanelets to which they apply."""
+    """Traffic rules (regulatory elements) of a Lanelet2 map, and the lanelets to which they apply."""
 
     elements: list[tuple[OsmElement, list[str]]] = field(
         default_factory=list[tuple[OsmElement, list[str]]]
@@ -51,7 +51,7 @@ class Rules:
         return rules
 
     def take(self, document: OsmDocument, element: OsmElement, users: list[str]) -> None:
-        """Add a regulatory element (traffic rule), with the lanelets that refer to it."""
+        """Add a traffic rule (regulatory element) and the lanelets that refer to it."""
         self.elements.append((element, users))
         refers = [way for way in element.members_of("refers") if way in document.lines]
         self.stop_lines += [way for way in element.members_of("ref_line") if way in document.lines]
@@ -73,7 +73,7 @@ class Rules:
 
 
 def _sign(tags: dict[str, str], element: OsmElement | None = None) -> tuple[str, str]:
-    """Return the kind of a traffic sign and its code, such as ``de274-60``."""
+    """Return the kind of a traffic sign, and its code such as ``de274-60``."""
     code = tags.get("subtype", "")
     if element is not None and not code:
         code = element.tags.get("sign_type", "")
@@ -87,7 +87,7 @@ def _sign(tags: dict[str, str], element: OsmElement | None = None) -> tuple[str,
 def plain_signals(
     document: OsmDocument, rules: Rules, lanes: Sequence[PlainLane], row_of: dict[str, int]
 ) -> list[PlainSignal]:
-    """Return the traffic lights, signs and stop lines of a Lanelet2 map, for the lane text format."""
+    """Return the traffic lights, signs and stop lines of a Lanelet2 map as signals of the lane text format."""
 
     def rows(lanelets: Iterable[str]) -> tuple[int, ...]:
         return tuple(sorted({row_of[one] for one in lanelets if one in row_of}))
@@ -121,7 +121,7 @@ def plain_signals(
 
 
 def _standing(name: str, kind: str, line: Floats) -> PlainSignal:
-    """Return a traffic light, sign or stop line at the position of a line."""
+    """Return a traffic light, sign or stop line that lies at a given line."""
     x, y, z = map(float, line.mean(axis=0))
     flat = line[:, :2]
     if run_of(line)[-1] < SHORTEST:

@@ -1,4 +1,4 @@
-"""Warnings about OpenDRIVE records that contradict others: lengths, positions, widths and references.
+"""Warnings about OpenDRIVE records that contradict each other: lengths, positions, widths and references.
 
 The records stay in the map as far as possible. A position beyond its road counts as the end of the
 road.
@@ -49,7 +49,7 @@ def contradictions(document: Document, lanes: LaneTable, plan: PlanView) -> list
 
 
 def _lengths(document: Document, plan: PlanView) -> Iterator[str]:
-    """Yield roads whose length contradicts their reference line, and gaps of reference lines."""
+    """Yield warnings: a road's length differs from its reference line, or the reference line has gaps."""
     names, length = document.road_ids, document.numbers("road", "length")
     reach = np.zeros(len(length))
     np.maximum.at(reach, plan.road, plan.s + plan.length)
@@ -77,7 +77,7 @@ def _lengths(document: Document, plan: PlanView) -> Iterator[str]:
 
 
 def _sections(document: Document, lanes: LaneTable) -> Iterator[str]:
-    """Yield lane sections that begin outside their road, too late, or at the same place as another section."""
+    """Yield warnings: a lane section begins outside its road, too late, or where another one begins."""
     sections, length = lanes.sections, document.numbers("road", "length")
     start, first = sections.start, sections.number == 0
     same = np.append(False, np.diff(start) <= 0)[: len(start)] & ~first
@@ -92,7 +92,7 @@ def _sections(document: Document, lanes: LaneTable) -> Iterator[str]:
 
 
 def _widths(document: Document, lanes: LaneTable) -> Iterator[str]:
-    """Yield lanes without a width, and widths that begin outside their section or too late."""
+    """Yield warnings: a lane has no width, or a width begins outside its section or too late."""
     has = np.zeros(len(lanes), bool)
     first = np.full(len(lanes), np.inf)
     for kind in (_WIDTH, "road/laneSection/lane/border"):
@@ -113,7 +113,7 @@ def _widths(document: Document, lanes: LaneTable) -> Iterator[str]:
 
 
 def _beyond(document: Document) -> Iterator[str]:
-    """Yield signals, objects and records that are outside their road."""
+    """Yield warnings: a signal, object or other record is outside its road."""
     length = document.numbers("road", "length")
     for kind in _PLACED:
         table, s = document[kind], document.rough_numbers(kind, "s")
@@ -129,7 +129,7 @@ def _beyond(document: Document) -> Iterator[str]:
 
 
 def _validities(document: Document, lanes: LaneTable) -> Iterator[str]:
-    """Yield signals that are valid only for lanes that do not exist at their position."""
+    """Yield warnings: a signal is valid only for lanes that do not exist at its position."""
     for kind in ("road/signal", "road/signalReference"):
         table, valid = document[kind], document[f"{kind}/validity"]
         if not len(valid):
@@ -151,7 +151,7 @@ def _validities(document: Document, lanes: LaneTable) -> Iterator[str]:
 
 
 def _references(document: Document) -> Iterator[str]:
-    """Yield references to signals and junctions that do not exist."""
+    """Yield warnings: a reference to a signal or junction that does not exist."""
     signals = {*document["road/signal"].texts("id")}
     junctions, roads = {*document["junction"].texts("id")}, {*document.road_ids}
     controllers = document["controller"].texts("id")
@@ -177,7 +177,7 @@ def _references(document: Document) -> Iterator[str]:
 
 
 def _doubled(document: Document) -> Iterator[str]:
-    """Yield ids that occur twice for signals and junctions, and roads with two links at one end."""
+    """Yield warnings: two signals or junctions have the same id, or a road has two links at one end."""
     for kind in ("road/signal", "junction", "controller"):
         for name, count in Counter(document[kind].texts("id")).items():
             if count > 1:
@@ -190,7 +190,7 @@ def _doubled(document: Document) -> Iterator[str]:
 
 
 def _junctions(document: Document) -> Iterator[str]:
-    """Yield roads of junctions that do not exist, and roads without a connection in their junction."""
+    """Yield warnings: a road's junction does not exist, or the junction has no connection with the road."""
     names = document["junction"].texts("id")
     kinds = dict(zip(names, document["junction"].texts("type"), strict=True))
     table = document["junction/connection"]

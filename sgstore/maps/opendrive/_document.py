@@ -1,4 +1,4 @@
-"""Parser of OpenDRIVE text into tables of XML elements, with bounded time and memory.
+"""Parser of OpenDRIVE text into tables of XML elements, with limited time and memory.
 
 The text is OpenDRIVE; the tables contain its elements.
 
@@ -114,11 +114,11 @@ class ElementTable:
 
     @property
     def of(self) -> Ints:
-        """Return the row of each element's parent element as an array (n,), int64."""
+        """Return the table row of each element's parent element, (n,) int64."""
         return np.asarray(self.parent, np.int64)
 
     def texts(self, name: str, default: str = "") -> list[str]:
-        """Return an attribute of all elements as texts, with a default for missing values."""
+        """Return an attribute of all elements as texts. Missing values get a default."""
         try:
             return [attributes[name] for attributes in self.attributes]
         except KeyError:
@@ -169,7 +169,7 @@ class Document:
         return self.tables[kind]
 
     def numbers(self, kind: str, name: str, default: float | None = None) -> Floats:
-        """Return an attribute of all elements of a kind as numbers.
+        """Return an attribute of all elements of a kind as numbers. Invalid ones count as defects.
 
         Invalid numbers mark their road as defective. The array is read-only.
 
@@ -196,7 +196,7 @@ class Document:
         return values
 
     def integers(self, kind: str, name: str, default: int | None = None) -> Ints:
-        """Return an attribute of all elements of a kind as integers.
+        """Return an attribute of all elements of a kind as integers. Invalid ones count as defects.
 
         Invalid numbers mark their road as defective.
         """
@@ -207,13 +207,13 @@ class Document:
         return values.astype(np.int64)
 
     def rough_numbers(self, kind: str, name: str, default: float = 0.0) -> Floats:
-        """Return an attribute of all elements of a kind as numbers: NaN if invalid, a default if missing."""
+        """Return an attribute of all elements of a kind as numbers: NaN if invalid, the default if missing."""
         values = _floats(self.tables[kind].texts(name, repr(default)))
         values[~(np.abs(values) <= MAX_MAGNITUDE)] = np.nan
         return values
 
     def accuse(self, kind: str, wrong: Bools, reason: str) -> None:
-        """Record a defect of the roads that contain the given elements."""
+        """Record a defect for each road that contains one of the given elements."""
         table = self.tables[kind]
         rows = np.flatnonzero(wrong)
         if kind in RECORDS and len(rows):
@@ -228,7 +228,7 @@ class Document:
                 self.blame[road] = MapError(reason, road=self.road_ids[road], element=table.element)
 
     def settle(self) -> None:
-        """Raise an error if defects of roads or records (such as lane widths) have been recorded."""
+        """Raise an error if defects were recorded for roads or records (such as lane widths)."""
         if self.blame or self.odd:
             raise Spoiled(self.blame, self.odd)
 
@@ -244,7 +244,7 @@ class Document:
             table.road = table.road[kept]
 
     def _records(self, kind: str, rows: Ints) -> list[Record]:
-        """Convert table rows to references to records: kind, road, number in the road.
+        """Return the reference of each table row: kind of record, road, and number within the road.
 
         The rows of a road are contiguous.
         """
@@ -255,7 +255,7 @@ class Document:
 
 
 def read_document(text: str, skip: frozenset[int] = frozenset()) -> Document:
-    """Parse an OpenDRIVE text into tables of elements, without the given roads.
+    """Parse an OpenDRIVE text into tables of elements. Leave out the given roads.
 
     Raises
     ------
@@ -302,7 +302,7 @@ class _Builder:
         self._roads = 0
 
     def start(self, tag: str, attributes: dict[str, str], _depth: int) -> None:
-        """Handle the start tag of an XML element: add a table row, enter the element, or skip it."""
+        """Handle the start tag of an XML element: add a table row, open the element, or skip it."""
         levels, rows = self._levels, self._rows
         node = levels[-1].get(tag)
         if node is None:
@@ -346,5 +346,5 @@ def _floats(texts: list[str]) -> Floats:
 
 
 def coefficients_of(document: Document, kind: str) -> Floats:
-    """Return the cubic coefficients a, b, c, d (n, 4) of all OpenDRIVE elements of a kind."""
+    """Return the coefficients a, b, c, d (n, 4) of all cubic polynomials in OpenDRIVE elements of a kind."""
     return np.stack([document.numbers(kind, letter, 0.0) for letter in "abcd"], axis=1)

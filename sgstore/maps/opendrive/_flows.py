@@ -1,4 +1,4 @@
-"""Connections between OpenDRIVE lanes: traffic can go from the first lane to the second.
+"""Connections between OpenDRIVE lanes: pairs of lanes, with traffic from the first to the second.
 
 A lane ends at one end of its section, or at both if traffic runs both ways. The lanes after it come
 from links to the next section or road (also into a road, in its middle), or from the connecting
@@ -80,7 +80,7 @@ def flows(document: Document, network: Network, ribbons: Ribbons) -> tuple[Ints,
 
 
 class _Links:
-    """Links of all lanes: to the next section, to the next road, or through a junction."""
+    """Links from each lane to the next section, the next road, or through a junction."""
 
     def __init__(self, document: Document, network: Network, ribbons: Ribbons) -> None:
         self._document, self._network = document, network
@@ -128,7 +128,7 @@ class _Links:
         return self._both[lane] or not contact or self._forward[lane] == (contact in {START, "+"})
 
     def named(self) -> _Named:
-        """Return, for each lane end, the lane ends to which its links refer, without missing lanes."""
+        """Return, for each lane end, the lane ends that its links name. Missing lanes are left out."""
         found: _Named = {}
         for contact, links in self._lane_links.items():
             ends = self._road_links[contact]
@@ -159,7 +159,7 @@ class _Links:
             self._say(f"road {name!r}: lane {self._ident[lane]} {way} a missing lane {to}")
 
     def _inner(self, lane: int, contact: str) -> Target | None:
-        """Return the next section of the same road, or ``None`` at the end of the road."""
+        """Return the next section in the same road as a target; ``None`` at the end of the road."""
         section, road = self._section[lane], self._road[lane]
         if contact == END and section < self._network.last[road]:
             return Target(section + 1, START)
@@ -168,7 +168,7 @@ class _Links:
         return None
 
     def _across(self, lane: int, contact: str, linked: list[int]) -> Iterator[tuple[Target, int]]:
-        """Yield the lanes of other roads to which a lane leads: their section, and their lane id."""
+        """Yield the lanes of other roads to which a lane leads, as lane section and lane id."""
         road = self._road[lane]
         link = self._road_links[contact].get(road, {})
         if link.get("elementType") == "junction":
@@ -215,7 +215,7 @@ class _Links:
         return math.dist(self._middle[one[1]][one[0]], self._middle[other[1]][other[0]])
 
     def _check(self, named: _Named) -> None:
-        """Report linked lanes that are far apart, or that lead traffic against each other."""
+        """Warn about linked lanes that are far apart, or whose directions of traffic are opposite."""
         rows = [
             (lane, contact == END, other, at == END)
             for (lane, contact), others in named.items()
@@ -246,7 +246,7 @@ class _Links:
                 )
 
     def _at_junction(self, lane: int, contact: str) -> bool:
-        """Return True if a lane end is at a junction. Then only the junction lists the lanes that follow."""
+        """Return True if a lane ends at a junction. The lanes after it are then listed only in the junction."""
         link = self._road_links[contact].get(self._road[lane], {})
         return self._inner(lane, contact) is None and link.get("elementType") == "junction"
 
@@ -260,7 +260,7 @@ class _Links:
             self._network.warnings.append(warning)
 
     def _ways(self) -> dict[tuple[str, str], list[_Way]]:
-        """Return the paths through junctions: (junction, incoming road) → list of paths."""
+        """Return the lanes that each junction connects: (junction, incoming road) → list of pairs of lanes."""
         network, document = self._network, self._document
         ways: dict[tuple[str, str], list[_Way]] = defaultdict(list)
         ends: dict[tuple[str, str], list[str]] = defaultdict(list)
@@ -302,7 +302,7 @@ class _Links:
     def _check_sources(
         self, junction: str, incoming: str, ends: list[str], pairs: _LanePairs
     ) -> None:
-        """Report lanes in a connection that its incoming road does not have at the junction."""
+        """Warn about lanes that a connection names, but that its incoming road does not have there."""
         sections = dict(self._sections(self._network.roads[incoming]))
         for source, _ in pairs:
             if ends and not any((sections[at], source) in self._network.lane for at in ends):
@@ -314,7 +314,7 @@ class _Links:
     def _entrances(
         self, junction: str, incoming: str, target: Target, pairs: _LanePairs
     ) -> list[str]:
-        """Link ends of a road to a junction that has a connection from this road, if their lanes touch."""
+        """Link a road to a junction if a connection of the junction names the road, and their lanes touch."""
         road = self._network.roads[incoming]
         for contact, section in self._sections(road):
             lanes = [(self._network.lane.get((section, source)), to) for source, to in pairs]
@@ -333,11 +333,11 @@ class _Links:
         return []
 
     def _sections(self, road: int) -> tuple[tuple[str, int], ...]:
-        """Return the last section of a road with its end, and the first section with its start."""
+        """Return both ends of a road with their lane sections: the end (last) and the start (first)."""
         return (END, self._network.last[road]), (START, self._network.first[road])
 
     def named_by_next(self, named: _Named) -> Iterator[tuple[int, int]]:
-        """Yield pairs of touching lanes that are linked only from the second lane to the first."""
+        """Yield pairs of touching lanes if only the second lane has a link to the first."""
         for (after, at), others in named.items():
             for before, end in others:
                 if (
@@ -358,7 +358,7 @@ class _Links:
                     yield before, after
 
     def _admits(self, before: int, end: str, after: int) -> bool:
-        """Return True unless the junction after a lane has no connection to the other lane."""
+        """Return False if the junction after a lane has connections, but none to the other lane."""
         link = self._road_links[end].get(self._road[before], {})
         if self._inner(before, end) is not None or not link:
             return True
@@ -374,7 +374,7 @@ class _Links:
         return bool(into) and not any(into)
 
     def touching(self, pairs: set[tuple[int, int]]) -> set[tuple[int, int]]:
-        """Return pairs of lanes without a link: a lane, and the only lane ahead that touches it."""
+        """Return pairs of lanes without a link: a lane, and the only lane that touches its end."""
         lanes, found = self._network.lanes, set[tuple[int, int]]()
         onward = {lane for lane, _ in pairs}
         for lane in range(len(self._road)):
@@ -402,7 +402,7 @@ class _Links:
         return len(kinds) == 1 or DRIVING.issuperset(kinds)
 
     def _ahead(self, lane: int, contact: str) -> list[Target]:
-        """Return the possible next sections of a lane without a link, each with the end at which they begin.
+        """Return the sections in which a lane without a link may continue, with the end that traffic enters.
 
         They are in its road, at the link of its road, or around the junction of its road.
         """
@@ -422,7 +422,7 @@ class _Links:
         return around or self._back.get((self._names[road], contact), [])
 
     def _is_lost(self, lane: int, contact: str, onward: set[int]) -> bool:
-        """Return True if a lane leads to a road but to no lane, like all lanes in its direction."""
+        """Return True if a lane leads to a road or junction, but no lane in its direction has a successor."""
         road = self._road[lane]
         if self._inner(lane, contact) is None:
             link = self._road_links[contact].get(road, {})
@@ -442,7 +442,7 @@ class _Links:
 def _ends(
     lanes: LaneTable, ribbons: Ribbons
 ) -> tuple[dict[str, list[tuple[float, ...]]], dict[str, list[float]]]:
-    """Return the middle and the width of each lane at the start and end of its section."""
+    """Return the middle and the width of each lane at the start and at the end of its section."""
     first, last = ribbons.offsets[:-1], ribbons.offsets[1:] - 1
     middle: dict[str, list[tuple[float, ...]]] = {}
     width: dict[str, list[float]] = {}
@@ -472,7 +472,7 @@ def _lane_pairs(document: Document) -> dict[int, _LanePairs]:
 
 
 def _branches(document: Document, network: Network) -> Iterator[tuple[int, int]]:
-    """Yield pairs of lanes in virtual junctions: a lane of the main road, and a lane that branches off."""
+    """Yield pairs of lanes in virtual junctions: a lane of the main road, and a lane that leaves it."""
     links = _lane_pairs(document)
     table = document["junction/connection"]
     junctions = document["junction"].attributes

@@ -42,7 +42,7 @@ _CROSSED: Final = frozenset({"none", "broken", "broken broken", "botts dots"})
 
 
 def permitted(kind: str, attribute: str, owner: int) -> tuple[bool, bool]:
-    """Return two flags for a road mark: lane changes to higher lane ids, and to lower lane ids, are permitted.
+    """Return two flags: a road mark permits lane changes to higher lane ids, and to lower lane ids.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ _Stretch = tuple[float, float, bool, bool]
 
 
 def read_lane_changes(document: Document, lanes: LaneTable, ribbons: Ribbons) -> LaneChanges:
-    """Return the parts of neighbouring lanes where road marks permit a lane change."""
+    """Return the parts of neighbouring lanes in which road marks permit a lane change."""
     left, right = wide_pairs(lanes, ribbons)
     driving = np.array([kind in DRIVING for kind in lanes.type], bool)
     one_way = lanes.forward[left] == lanes.forward[right]
@@ -87,7 +87,7 @@ def read_lane_changes(document: Document, lanes: LaneTable, ribbons: Ribbons) ->
 
 
 def _marks(document: Document, lanes: LaneTable) -> Callable[[int, int], list[_Stretch]]:
-    """Return a function that finds the road marks on the common border of two neighbouring lanes."""
+    """Return a function that finds the road marks between two neighbouring lanes."""
     records = _records(document, "laneChange")
     of_lane = {int(lanes.row[raw]): marks for raw, marks in records.items()}
     centres = {raw: int(lanes.centre[raw]) for raw in records}
@@ -114,7 +114,7 @@ def _marks(document: Document, lanes: LaneTable) -> Callable[[int, int], list[_S
 
 
 def _records(document: Document, name: str) -> dict[int, list[tuple[float, str, str]]]:
-    """Return the road marks of each lane as in the text: offset, type, and one more attribute."""
+    """Return the road marks of each lane as they are in the text: offset, type, and one named attribute."""
     kind = "road/laneSection/lane/roadMark"
     table, offsets = document[kind], document.rough_numbers(kind, "sOffset").tolist()
     columns = table.parent, offsets, table.texts("type", "none"), table.texts(name)
@@ -134,7 +134,7 @@ MarkingParts: TypeAlias = dict[int, list[list[tuple[float, Attributes]]]]
 def read_markings(
     document: Document, lanes: LaneTable
 ) -> tuple[dict[int, Attributes], MarkingParts]:
-    """Return the markings of lanes as attributes of their nodes: type, colour, width, permitted lane change.
+    """Return the markings of each lane as attributes of its node: type, colour, width, permitted lane change.
 
     Left and right are those of traffic on the lane. Of several markings along a border, the longest one counts
     for the lane. The second result has all of them.
@@ -186,7 +186,7 @@ def read_markings(
 def _beside(
     lanes: LaneTable, row: int, ident: int
 ) -> Callable[[tuple[str, str, str, float]], Attributes]:
-    """Return a function that converts the marking on a lane's border with lane ``ident`` to lane attributes."""
+    """Return a function that converts the marking between a lane and lane ``ident`` to node attributes."""
     # Outside is right for a lane on the right of its road's direction.
     forward = bool(lanes.forward[row])
     is_left = (lanes.ident[row] == ident) == ((lanes.ident[row] < 0) != forward)
@@ -208,7 +208,7 @@ _LONGEST: Final = 40
 
 
 def read_broad_lines(document: Document, lanes: LaneTable, ribbons: Ribbons) -> MapPlaces:
-    """Return the parts of lanes with a ``bold`` (broad) marking at their border."""
+    """Return the parts of lanes that have a ``bold`` (broad) marking at their border."""
     names = zip(lanes.section.tolist(), lanes.ident.tolist(), strict=True)
     row_of = {name: row for row, name in enumerate(names)}
     rows: list[tuple[int, bool, float, float]] = []
@@ -242,7 +242,7 @@ def read_broad_lines(document: Document, lanes: LaneTable, ribbons: Ribbons) -> 
 
 
 def _along(ribbons: Ribbons, lane: Ints, to: Ints, ends: Floats) -> LaneChanges:
-    """Convert intervals of road positions s to intervals along lane centre lines. Adjacent ones are joined."""
+    """Convert intervals of road positions ``s`` to intervals along lanes. Adjacent intervals are joined."""
     one, other = ribbons.along_at(lane, ends[:, 0]), ribbons.along_at(lane, ends[:, 1])
     start, end = np.minimum(one, other), np.maximum(one, other)
     order = np.lexsort((start, to, lane))

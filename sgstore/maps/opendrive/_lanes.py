@@ -131,13 +131,13 @@ class LaneTable:
         return len(self.section)
 
     def name(self, document: Document, lane: int) -> str:
-        """Return the name of a lane in warnings: its road, the number of its section, its id."""
+        """Return the name of a lane for warnings: its road, number of its section, and lane id."""
         road = document.road_ids[self.road[lane]]
         return f"lane {road}/{self.sections.number[self.section[lane]]}/{self.ident[lane]}"
 
 
 def read_lanes(document: Document) -> LaneTable:
-    """Read all lane sections and lanes of an OpenDRIVE map, and record defective roads."""
+    """Read all lane sections and lanes of an OpenDRIVE map. Record defects of roads."""
     sections, section_row = _read_sections(document)
     table = document["road/laneSection/lane"]
     ident = document.integers("road/laneSection/lane", "id")
@@ -165,7 +165,7 @@ def read_lanes(document: Document) -> LaneTable:
 
 
 def odd_sections(document: Document) -> list[str]:
-    """Return warnings about lane sections for one side of a road, which are read as two-sided."""
+    """Return warnings about lane sections that declare one side of a road only. They are read as two-sided."""
     table = document["road/laneSection"]
     roads = {
         document.road_ids[road]
@@ -204,7 +204,7 @@ def _read_sections(document: Document) -> tuple[LaneSections, Ints]:
 
 
 def _stack(section: Ints, ident: Ints) -> tuple[Ints, Ints]:
-    """Return the next lane towards the road centre, and the number of lanes in between, for each lane."""
+    """For each lane, return the next lane towards the road centre, and its number from the centre (from 0)."""
     n = len(ident)
     order = np.lexsort((np.abs(ident), ident > 0, section))
     same = (np.diff(section[order]) == 0) & (np.diff((ident > 0)[order].astype(np.int8)) == 0)
@@ -220,7 +220,7 @@ def _stack(section: Ints, ident: Ints) -> tuple[Ints, Ints]:
 
 @dataclass(frozen=True, slots=True)
 class _LaneIntervals:
-    """Intervals of OpenDRIVE lane sections. On an interval, each width or height is one cubic polynomial."""
+    """Intervals of OpenDRIVE lane sections. In each, lane widths and heights are single cubic polynomials."""
 
     section: Ints
     start: Floats
@@ -263,7 +263,7 @@ def _intervals(document: Document, lanes: LaneTable, plan: PlanView) -> _LaneInt
 
 
 def _ends_of_width(document: Document, lanes: LaneTable) -> list[tuple[Ints, Floats]]:
-    """Return the positions at which the width of a lane becomes negative or positive, by section.
+    """Return the positions at which the width of a lane changes its sign, by lane section.
 
     Each lane with a negative width causes a warning. Between the places its width counts as 0.
     """
@@ -294,7 +294,7 @@ def _ends_of_width(document: Document, lanes: LaneTable) -> list[tuple[Ints, Flo
 
 
 def _shifted(coefficients: Floats, by: Floats) -> Floats:
-    """Return cubic polynomials, shifted so that their variable starts at ``by``."""
+    """Return cubic polynomials after a shift of their variable by ``by``."""
     return np.stack(
         (
             cubic(coefficients, by),
@@ -309,7 +309,7 @@ def _shifted(coefficients: Floats, by: Floats) -> Floats:
 def _along_road(
     document: Document, kind: str, lanes: LaneTable, intervals: _LaneIntervals
 ) -> Floats:
-    """Return the cubic polynomial of a road property (such as elevation) on each road interval, (n, 4)."""
+    """Return the cubic polynomial of a road property (such as elevation) in each road interval, (n, 4)."""
     middle = (intervals.start + intervals.end) / 2
     at = document.numbers(kind, "s")
     record = last_before(document[kind].road, at, lanes.sections.road[intervals.section], middle)
@@ -366,7 +366,7 @@ def _borders(
 def _of_lanes(
     document: Document, tag: str, lanes: LaneTable, at: tuple[Ints, Floats, Floats]
 ) -> tuple[Floats, Bools]:
-    """Return the cubics of lane records (width or border) at some positions, and a mask of existing records."""
+    """Return the cubic polynomial of lane widths or borders at some positions, and a mask of existing ones."""
     kind = f"road/laneSection/lane/{tag}"
     lane, middle, start = at
     of = lanes.row[document[kind].of]
@@ -385,7 +385,7 @@ def _pieces(
     plan: PlanView,
     parts: tuple[_LaneIntervals, _LaneBorders, Floats],
 ) -> tuple[Ints, Ints]:
-    """Return the number of straight pieces of each road interval, and its record of the reference line."""
+    """Return the number of straight pieces of each road interval, and the row of its reference line record."""
     intervals, borders, heights = parts
     length = intervals.end - intervals.start
     road = lanes.sections.road[intervals.section]
@@ -418,7 +418,7 @@ def _pieces(
 
 
 def _bound(document: Document, lanes: LaneTable, intervals: _LaneIntervals, pieces: Floats) -> None:
-    """Reject roads, or the whole map, if their surfaces need too many pieces."""
+    """Raise an error if the surface of a road, or of the whole map, needs too many pieces."""
     road = lanes.sections.road[intervals.section]
     lanes_here = np.bincount(lanes.section, minlength=len(lanes.sections.start)) + 1.0
     points = (pieces + 1) * lanes_here[intervals.section]
@@ -464,7 +464,7 @@ def _stations(
 def _lateral_jumps(
     intervals: _LaneIntervals, borders: _LaneBorders
 ) -> tuple[Floats, Floats, Floats]:
-    """Return the largest offset, jump and change of direction of lane borders at the end of each interval."""
+    """Return, at the end of each interval, the largest offset, jump and bend of lane borders."""
     n = len(intervals.section)
     length = (intervals.end - intervals.start)[borders.interval]
     reach, step, corner = np.zeros(n), np.zeros(n), np.zeros(n)
@@ -512,7 +512,7 @@ def surface(document: Document, lanes: LaneTable, plan: PlanView) -> Ribbons:
 def heights(
     document: Document, lanes: LaneTable, ribbons: Ribbons
 ) -> Callable[[Ints, Floats], Floats] | None:
-    """Return a function: (lane, position along it) → height; m. ``None`` if the map has no heights.
+    """Return a function from lane and position along it to the height (m); ``None`` if the map has no heights.
 
     Between cross sections a lane is straight. This is exact enough for heights, but not for slopes.
     ``ribbons`` can have more lanes, without a road.

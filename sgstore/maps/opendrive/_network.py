@@ -21,7 +21,7 @@ END: Final = "end"
 
 
 class Target(NamedTuple):
-    """Place to which an OpenDRIVE link leads: a lane section, and where traffic enters it."""
+    """Place to which an OpenDRIVE link leads: a lane section, and the end at which traffic enters."""
 
     section: int
     contact: str
@@ -72,7 +72,7 @@ class Network:
         return self.first[road] + max(within, 0)
 
     def target(self, attributes: dict[str, str]) -> Target | None:
-        """Return the lane section that a road link leads to, or ``None`` for an unknown road."""
+        """Return the lane section to which a road link leads; ``None`` if the road is unknown."""
         road = self.roads.get(attributes.get("elementId", ""))
         if road is None:
             return None
@@ -90,12 +90,12 @@ class Network:
 
 
 def road_links(table: ElementTable) -> dict[int, dict[str, str]]:
-    """Return the predecessor or successor of each road: row of the road → attributes of the link."""
+    """Return the predecessor or successor of each road: row of the road → XML attributes of the link."""
     return dict(zip(table.parent, table.attributes, strict=True))
 
 
 def junction_ends(document: Document) -> Iterator[tuple[int, str, str]]:
-    """Yield the ends of roads at junctions: row of the road, start or end, and id of the junction."""
+    """Yield each end of a road that is at a junction: row of the road, start or end, id of the junction."""
     for kind, contact in (("road/predecessor", START), ("road/successor", END)):
         for row, attributes in road_links(document[kind]).items():
             if attributes.get("elementType") == "junction":
@@ -103,7 +103,7 @@ def junction_ends(document: Document) -> Iterator[tuple[int, str, str]]:
 
 
 def whole(text: str) -> int:
-    """Return the integer of an OpenDRIVE lane id, or 0 (the centre lane, without traffic) if it is invalid."""
+    """Return an OpenDRIVE lane id as an integer; 0 (the centre lane, without traffic) if it is invalid."""
     try:
         return int(text)
     except ValueError:

@@ -61,13 +61,13 @@ def lane_nodes(document: Document, lanes: LaneTable, ribbons: Ribbons) -> MapNod
 
 
 def junction_of(document: Document, road: int) -> str:
-    """Return the id of the junction that a road is part of, or an empty text."""
+    """Return the id of the junction to which a road belongs; empty if it belongs to none."""
     junction = document["road"].attributes[road].get("junction", "-1")
     return "" if junction == "-1" else junction
 
 
 def _turns(document: Document, lanes: LaneTable, ribbons: Ribbons) -> tuple[str, ...]:
-    """Return the turn direction of each lane in a junction. All sections of a road have one turn."""
+    """Return the turn direction of each lane in a junction. All sections of a road have the same one."""
     sign = np.where(lanes.forward, 1.0, -1.0)
     _, one = np.unique(lanes.section, return_index=True)
     of_road = np.zeros(len(document["road"]))
@@ -80,7 +80,7 @@ def _turns(document: Document, lanes: LaneTable, ribbons: Ribbons) -> tuple[str,
 
 
 def _speed_limits(document: Document, lanes: LaneTable) -> Floats:
-    """Return the speed limit at the middle of each lane: its own, or else that of the road; m/s."""
+    """Return the speed limit in the middle of each lane: that of the lane, or else of the road; m/s."""
     sections = lanes.sections
     start, end = sections.start[lanes.section], sections.end[lanes.section]
     middle = (start + end) / 2
@@ -117,7 +117,7 @@ def speed(value: str, unit: str) -> float:
 
 
 def wide_pairs(lanes: LaneTable, ribbons: Ribbons) -> Ints:
-    """Return pairs of neighbouring lanes (2, n), the left one first, that share a border."""
+    """Return pairs of lanes (2, n) that share a border, the left lane first."""
     return _pairs(lanes, np.flatnonzero(ribbons.mean_widths() > NARROW))
 
 
@@ -145,7 +145,7 @@ def neighbours(lanes: LaneTable, ribbons: Ribbons) -> list[Edge]:
 
 
 def _pairs(lanes: LaneTable, rows: Ints) -> Ints:
-    """Return pairs of consecutive lanes (2, n) of a lane section, among the given lanes."""
+    """Return pairs of adjacent lanes (2, n) in the same lane section, among the given lanes."""
     same: Bools = np.diff(lanes.section[rows]) == 0
     return np.stack((rows[:-1][same], rows[1:][same]))
 
@@ -194,7 +194,7 @@ def _roundabouts(document: Document) -> dict[str, set[str]]:
 
 
 def _in_roundabouts(document: Document) -> Iterator[tuple[int, int]]:
-    """Yield pairs of row numbers: a road, and the roundabout that contains it."""
+    """Yield pairs of node rows: a road, and the roundabout to which it belongs."""
     ends: list[list[str]] = [[] for _ in range(len(document["road"]))]
     for road, _, junction in junction_ends(document):
         ends[road].append(junction)
@@ -206,7 +206,7 @@ def _in_roundabouts(document: Document) -> Iterator[tuple[int, int]]:
 
 
 def road_types(document: Document) -> dict[str, tuple[tuple[float, str], ...]]:
-    """Return the types (such as ``town``) of roads: road → (start position, type) in order."""
+    """Return the types (such as ``town``) of each road: road → list of (start position, type)."""
     table = document["road/type"]
     found: dict[str, list[tuple[float, str]]] = {}
     places = document.rough_numbers("road/type", "s").tolist()

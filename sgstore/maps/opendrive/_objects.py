@@ -74,7 +74,7 @@ _CIRCLE: Final = np.linspace(0.0, 2 * np.pi, 16, endpoint=False)
 
 
 def kind_of_object(type_name: str, name: str) -> str:
-    """Return the kind of an OpenDRIVE object from its type; for an unknown type, from words in its name.
+    """Return the kind of an OpenDRIVE object, from its type; if the type is unknown, from words in its name.
 
     :data:`PARKING` and :data:`PAINT` for objects that are not entities; ``prop`` for all others.
     """
@@ -96,7 +96,7 @@ def _singular(word: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Objects:
-    """Objects of an OpenDRIVE map, such as trees and buildings: a map node and a geometry each."""
+    """Objects of an OpenDRIVE map, such as trees and buildings. Each has a map node and a geometry."""
 
     nodes: MapNodes
     shapes: list[Any]
@@ -116,7 +116,7 @@ class _Ring(NamedTuple):
 
 @dataclass(slots=True)
 class _Items:
-    """Objects at the roads with their outlines, one row per copy of a repeated object.
+    """Objects at the roads and their outlines, with one row for each copy of a repeated object.
 
     Corners in ``local`` are in the item's own axes; corners in ``along`` are s and t of its road.
     """
@@ -134,7 +134,7 @@ class _Items:
     def add(
         self, row: int, name: str, place: tuple[float, float, float], size: tuple[float, float]
     ) -> int:
-        """Add one copy of an object at a road position, and return its row number."""
+        """Add a copy of an object at a road position. Return the row of the copy."""
         self.row.append(row)
         self.name.append(name)
         self.place.append(place)
@@ -187,7 +187,7 @@ def read_objects(
 
 
 def _space(objects: Objects, row: int) -> PlainLane | None:
-    """Convert a parking space to a lane along its heading, or ``None`` if it has no area."""
+    """Convert a parking space to a lane in the direction of its heading; ``None`` if it has no area."""
     nodes, shape = objects.nodes, objects.shapes[row]
     if shape.area <= 0:
         return None
@@ -212,7 +212,7 @@ def _space(objects: Objects, row: int) -> PlainLane | None:
 
 
 def _quadrangle(shape: Any) -> Floats:
-    """Return four corners (4, 2) of a shape or of its bounding rectangle, counter-clockwise."""
+    """Return four corners (4, 2) counter-clockwise: those of the shape, or of the rectangle around it."""
     if shape.geom_type != "Polygon" or len(shape.exterior.coords) != 5 or not shape.is_valid:
         shape = shapely.minimum_rotated_rectangle(shape)
     corners = np.asarray(shape.exterior.coords, np.float64)[:-1]
@@ -221,7 +221,7 @@ def _quadrangle(shape: Any) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class _Repeat:
-    """OpenDRIVE element ``repeat``: copies of an object along the road, or one continuous strip."""
+    """OpenDRIVE element ``repeat``: several copies of an object along the road, or one continuous strip."""
 
     s: float
     length: float
@@ -231,19 +231,19 @@ class _Repeat:
     width: tuple[float, float]
 
     def copies(self) -> int:
-        """Return the number of copies of the object. For a strip, it is the number of steps along the road."""
+        """Return the number of copies of the object. For a strip: the number of points along the road."""
         step = self.distance if self.distance > 0 else max(_STRIP_STEP, self.length / _MOST_STEPS)
         return int(min(np.floor(self.length / step + 1e-9), MOST_POINTS)) + 1
 
     def shares(self, n: int) -> Floats:
-        """Return the relative positions 0 … 1 (n,) of the n copies of a repeated object."""
+        """Return the positions of the n copies of a repeated object, from 0 (start) to 1 (end), (n,)."""
         if self.distance > 0 and self.length > 0:
             return np.arange(n, dtype=np.float64) * (self.distance / self.length)
         return np.linspace(0.0, 1.0, n)
 
 
 def _repeats(document: Document) -> dict[int, list[_Repeat]]:
-    """Return the valid ``repeat`` elements (copies along the road) of each OpenDRIVE object: row → list."""
+    """Return the valid ``repeat`` elements of each OpenDRIVE object: row of the object → list."""
     kind = "road/object/repeat"
     names = ("s", "length", "distance", "tStart", "tEnd", "zOffsetStart", "zOffsetEnd")
     columns = [document.rough_numbers(kind, name) for name in names]
@@ -260,7 +260,7 @@ def _repeats(document: Document) -> dict[int, list[_Repeat]]:
 
 
 class _Outlines:
-    """Outlines of OpenDRIVE objects, as corners (k, 2), in object axes or road coordinates."""
+    """Outlines of OpenDRIVE objects as corners (k, 2), relative to the object or in road coordinates."""
 
     def __init__(self, document: Document) -> None:
         kind = "road/object"
@@ -271,14 +271,14 @@ class _Outlines:
         self.ids = document[kind].texts("id")
 
     def of(self, row: int) -> tuple[list[Floats], list[Floats]]:
-        """Return two lists of outlines of an object: in object axes, and in road coordinates."""
+        """Return two lists of outlines of an object: relative to the object, and in road coordinates."""
         place = np.array((self.own["s"][row], self.own["t"][row]))
         along = [ring - place for ring in self.along.get(row, [])]
         local = self.local.get(row, [])
         return (local if local or along else [self._plain(row)]), along
 
     def _plain(self, row: int) -> Floats:
-        """Return the outline of an object made from its length and width or its radius; otherwise a point."""
+        """Return the outline of an object from its length and width, or its radius; otherwise a point."""
         length, width, radius = (self.own[name][row] for name in ("length", "width", "radius"))
         if length > 0 and width > 0:
             return np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) * (length / 2, width / 2)
@@ -288,7 +288,7 @@ class _Outlines:
 
 
 def _corners(document: Document, tag: str, names: tuple[str, str]) -> dict[int, list[Floats]]:
-    """Return the valid outlines of OpenDRIVE objects with one kind of corners: object row → outlines."""
+    """Return the valid outlines of OpenDRIVE objects, for one kind of corners: row of the object → outlines."""
     kind = f"road/object/outline/{tag}"
     points = np.column_stack([document.rough_numbers(kind, name) for name in names])
     outline = document[kind].of
@@ -304,7 +304,7 @@ def _corners(document: Document, tag: str, names: tuple[str, str]) -> dict[int, 
 def _items(
     outlines: _Outlines, repeats: dict[int, list[_Repeat]], rows: list[int], warnings: list[str]
 ) -> _Items:
-    """Return all copies of the given OpenDRIVE objects, as rows with outlines."""
+    """Return all copies of some OpenDRIVE objects, one row each, with outlines."""
     items = _Items()
     own = outlines.own
     for row in rows:
@@ -337,7 +337,7 @@ _Rings = tuple[list["Floats"], list["Floats"]]
 
 
 def _stand(items: _Items, item: int, rings: _Rings) -> None:
-    """Add outlines to one copy of an object, at the position of the copy."""
+    """Add the outlines of an object to one of its copies, moved to the position of the copy."""
     s, t, _ = items.place[item]
     items.local.extend(_Ring(item, ring) for ring in rings[0])
     items.along.extend(_Ring(item, ring + np.array((s, t))) for ring in rings[1])
@@ -350,7 +350,7 @@ def _copy(
     repeat: _Repeat,
     one: tuple[_Rings, tuple[float, float]],
 ) -> int:
-    """Add the copies of an object that a ``repeat`` element describes. Return the next copy number."""
+    """Add the copies that a ``repeat`` element requests for an object. Return the number for the next copy."""
     shares = repeat.shares(repeat.copies()).tolist()
     for number, share in enumerate(shares, name[1]):
         place = (
@@ -363,7 +363,7 @@ def _copy(
 
 
 def _stretch(items: _Items, row: int, name: str, repeat: _Repeat) -> None:
-    """Add the continuous strip that a ``repeat`` element without a distance describes."""
+    """Add the continuous strip that a ``repeat`` element without distance requests."""
     n = repeat.copies() + 1
     share = repeat.shares(n)
     s, t = repeat.s + share * repeat.length, np.interp(share, (0, 1), repeat.t)
@@ -395,14 +395,14 @@ def _placed(
 
 
 def _laid_out(rings: list[_Ring]) -> tuple[Floats, Ints]:
-    """Concatenate the corners of outlines. Return the corners, and the object row of each corner."""
+    """Concatenate the corners of all outlines. Return them, and the object row of each corner."""
     points = np.concatenate([np.zeros((0, 2)), *(ring.corners for ring in rings)])
     items = np.array([ring.item for ring in rings], np.int64)
     return points, np.repeat(items, np.array([len(ring.corners) for ring in rings], np.int64))
 
 
 def _moved(rings: list[_Ring], points: Floats) -> Iterator[_Ring]:
-    """Yield copies of outlines whose corners are replaced by new points, in order."""
+    """Replace the corners of outlines by the given points, in order. Yield the new outlines."""
     end = 0
     for ring in rings:
         begin, end = end, end + len(ring.corners)

@@ -13,12 +13,12 @@ if TYPE_CHECKING:
 
 
 def starts_of(counts: Ints) -> Ints:
-    """Return the start indices of consecutive groups of the given sizes, and the end, (n + 1,)."""
+    """Return the index at which each of the consecutive groups starts, and the end, (n + 1,)."""
     return np.concatenate((np.zeros(1, np.int64), np.cumsum(counts, dtype=np.int64)))
 
 
 def ragged(counts: Ints) -> tuple[Ints, Ints]:
-    """Number the rows of consecutive groups: return each row's group, and its index in the group.
+    """For consecutive groups of the given sizes, return each row's group, and its index in the group.
 
     >>> ragged(np.array([2, 0, 3]))
     (array([0, 0, 2, 2, 2]), array([0, 1, 0, 1, 2]))
@@ -27,7 +27,7 @@ def ragged(counts: Ints) -> tuple[Ints, Ints]:
 
 
 def last_before(group: Ints, at: Floats, asked_group: Ints, asked_at: Floats) -> Ints:
-    """Find, for each position on a road, the last record of this road that starts at or before it.
+    """For each position on a road, find the last record of the road that starts at or before it.
 
     Parameters
     ----------

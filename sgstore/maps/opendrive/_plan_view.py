@@ -32,7 +32,7 @@ _BELOW_ONE: Final = 1 - 1e-12
 
 @dataclass(frozen=True, slots=True)
 class _Measure:
-    """Arc lengths of cubic curves, each with the share of the length at 65 equal steps of the parameter."""
+    """Arc lengths of cubic curves. Also the share of the length at 65 equal steps of the curve parameter."""
 
     span: Floats
     length: Floats
@@ -124,7 +124,7 @@ def read_plan_view(document: Document) -> PlanView:
 def _read_spirals(
     document: Document, kind: Codes, curvature: Floats, rate: Floats, length: Floats
 ) -> Ints:
-    """Read all spirals, and return the rows of those without a usable curvature."""
+    """Read all spirals. Return the rows of the spirals without a usable curvature."""
     spirals = document["road/geometry/spiral"].of
     first, last = (
         document.rough_numbers("road/geometry/spiral", name, np.nan)
@@ -140,7 +140,7 @@ def _read_spirals(
 
 
 def _curve_between(columns: dict[str, Any], row: int, after: int | None) -> tuple[Floats, Floats]:
-    """Return the cubic from one geometry record to the next, in axes of the first; a line if they differ."""
+    """Return the cubic curve from one geometry record to the next; a straight line if they do not fit."""
     length, heading = columns["length"][row], columns["heading"][row]
     start, end = np.array([1.0, 0.0]) * length, np.array([length, 0.0])
     slope = start
@@ -173,7 +173,7 @@ def _read_cubics(document: Document, kind: Codes, length: Floats) -> tuple[Float
 
 
 def _measured(u: Floats, v: Floats, span: Floats, length: Floats) -> _Measure:
-    """Compute the arc lengths of cubic curves, and the shares of the length at equal parameter steps."""
+    """Compute the arc length of cubic curves, and its share at equal steps of the curve parameter."""
     unknown = np.isnan(span)
     reach = np.where(unknown, length, span)  # the arc length is never shorter than u
     arc = _arc_table(u, v, reach)
@@ -195,7 +195,7 @@ def _arc_table(u: Floats, v: Floats, span: Floats) -> Floats:
 
 
 def _parameter(u: Floats, v: Floats, measure: _Measure, rows: Ints, share: Floats) -> Floats:
-    """Return the curve parameter at which a cubic curve reaches a share of its arc length.
+    """Return the curve parameter at which a cubic curve has reached a share of its length.
 
     Cubic Hermite interpolation in the cell of the table.
     """
@@ -257,7 +257,7 @@ def poses(plan: PlanView, record: Ints, s: Floats) -> Poses:
 
 
 def _spiral(ds: Floats, curvature: Floats, rate: Floats) -> tuple[Floats, Floats]:
-    """Return the displacement along and across after a length ``ds`` on a clothoid (road spiral)."""
+    """Return how far a spiral (clothoid) goes along and across its start direction after a length ``ds``."""
     at = ds[:, None] * ((_NODES + 1) / 2)
     angle = at * (curvature[:, None] + rate[:, None] * at / 2)
     half = ds / 2
@@ -265,7 +265,7 @@ def _spiral(ds: Floats, curvature: Floats, rate: Floats) -> tuple[Floats, Floats
 
 
 def _cubic(plan: PlanView, record: Ints, ds: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return displacement, turn and curvature after a length ``ds`` on parametric cubic curves."""
+    """Return displacement, turn and curvature of parametric cubic curves after a length ``ds``."""
     number = np.cumsum(plan.kind == CUBIC) - 1
     length = plan.length[record]
     share = np.where(length > 0, ds / np.maximum(length, _TINY), 0.0)

@@ -22,7 +22,7 @@ _PLACE: Final = ("s", "t", "zOffset", "hdg", "hOffset")
 def places(
     document: Document, plan: PlanView, road: Ints, s: Floats, t: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Convert road coordinates ``s`` and ``t`` to map positions and headings, clamped to the road ends.
+    """Convert road coordinates ``s`` and ``t`` to map positions and headings. Limit ``s`` to the road.
 
     Returns x, y and z in map axes, and the heading of the road there.
     """
@@ -43,7 +43,7 @@ def places(
 
 
 def standing(document: Document, kind: str, rows: Ints, warnings: list[str]) -> Ints:
-    """Return the rows of signals or objects with a valid position. Other rows add a warning."""
+    """Return the rows of signals or objects with a valid position. Add a warning for each other row."""
     table = document[kind]
     placed = np.ones(len(table), bool)
     for name in _PLACE:
@@ -63,7 +63,7 @@ def node_columns(
     rows: Ints,
     at: tuple[Floats, Floats, Floats] | None = None,
 ) -> dict[str, Any]:
-    """Return the map node columns (position, heading, size) for signals or objects.
+    """Return the columns of map nodes (position, heading, size) for signals or objects.
 
     ``at`` is s, t and the height above the road, else the element's own. The heading is the sum of
     the road's and the element's heading.

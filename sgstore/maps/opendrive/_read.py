@@ -120,7 +120,7 @@ def parse_map(text: str, name: str, signs: Signs = SIGNS) -> RoadMap:
 
 
 def _without(odd: Mapping[Record, MapError], skip: Container[int]) -> list[str]:
-    """Return warnings about records (such as lane widths) that are left out: one for each road and kind."""
+    """Return warnings about records that are left out (such as lane widths), one per road and kind."""
     groups: dict[tuple[str, int], list[MapError]] = {}
     for (kind, road, _), error in odd.items():
         if road not in skip:
@@ -188,7 +188,7 @@ def _build(document: Document, text: str, name: str, signs: Signs) -> RoadMap:
 
 
 def _at_the_end(shapes: list[Any], number: int) -> NDArray[Any]:
-    """Return an array of shapes for all map nodes, in which only the last nodes have a shape."""
+    """Return an array with one shape per map node. The last nodes get the given shapes, the others ``None``."""
     found = np.full(number, None, object)
     found[number - len(shapes) :] = shapes
     return found

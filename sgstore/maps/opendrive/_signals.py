@@ -45,7 +45,7 @@ _READERS: Final = {"asam": "as ASAM OpenDRIVE reads it", "carla": "as CARLA read
 
 @dataclass(slots=True)
 class Doubts:
-    """Collector of signals in an OpenDRIVE map whose orientation contradicts the direction of their lanes.
+    """Check of an OpenDRIVE map for signals whose orientation contradicts the direction of their lanes.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ class Doubts:
         there: frozenset[int],
         readings: tuple[frozenset[int], frozenset[int]],
     ) -> None:
-        """Check the orientation of a signal at a road position against the lanes there.
+        """Check whether the orientation of a signal fits the lanes at its road position.
 
         ``there``: the driving lanes at this place; ``readings``: the lanes of its orientation in
         the chosen and in the other interpretation.
@@ -119,7 +119,7 @@ class Doubts:
         return bool(lanes.both[lane] or lanes.forward[lane] == (end == END))
 
     def _before(self, road: int, s: float) -> str:
-        """Return the end of a road that has a junction near the given position, or an empty text."""
+        """Return the end (``start`` or ``end``) of a road with a junction near a position, or an empty text."""
         if not self._junctions:
             self._lengths = self.document.rough_numbers("road", "length").tolist()
             ends = [(road, at) for road, at, _ in junction_ends(self.document)]
@@ -169,7 +169,7 @@ Stops = frozenset[tuple[int, float]]
 
 @dataclass(frozen=True, slots=True)
 class Signals:
-    """Traffic lights and signs of an OpenDRIVE map, with the lanes that they apply to.
+    """Traffic lights and signs of an OpenDRIVE map, with the lanes to which they apply.
 
     Attributes
     ----------
@@ -199,13 +199,13 @@ class Signals:
         return ("controlsTrafficOf", signal, FIRST_LANE + lane)
 
     def places(self, first: int) -> tuple[Ints, Ints, Floats]:
-        """Return as columns: signals, their lanes, and the road positions ``s`` at which they apply."""
+        """Return three columns: signals, their lanes, and the road positions ``s`` where they apply."""
         rows = [(row, *one) for row, lanes in enumerate(self.lanes) for one in sorted(lanes)]
         row, lane = np.array([one[:2] for one in rows], np.int64).reshape(-1, 2).T
         return first + row, lane, np.array([s for *_, s in rows], np.float64)
 
     def stop_lines(self, first: int) -> Ints:
-        """Return the node rows of the signals that are painted stop lines."""
+        """Return the node rows of those signals that are painted stop lines."""
         return first + np.array([r for r, c in enumerate(self.codes) if c == _STOP_LINE], np.int64)
 
 
@@ -252,7 +252,7 @@ def kind_of_signal(code: str, *, dynamic: bool, name: str = "") -> str:
 
 
 class _Reach:
-    """Look-up of the driving lanes at a road position, for the signals that apply there."""
+    """Look-up of the driving lanes at a road position to which a signal applies."""
 
     def __init__(self, document: Document, network: Network, orientation: str) -> None:
         self.warnings = network.warnings
@@ -274,7 +274,7 @@ class _Reach:
         self._known: dict[tuple[int, object], frozenset[int]] = {}
 
     def valid(self, element: tuple[str, int, str], place: tuple[int, float]) -> frozenset[int]:
-        """Return the driving lanes at a road position to which a validity element of a signal applies."""
+        """Return the driving lanes at a road position that a signal's validity or orientation selects."""
         kind, row, signal = element
         ranges = self._ranges[kind].get(row)
         orientation = self._tables[kind].attributes[row].get("orientation", "")
@@ -299,14 +299,14 @@ class _Reach:
         return self._known[key]
 
     def on_side(self, place: tuple[int, float], *, left: bool) -> frozenset[int]:
-        """Return the driving lanes at a road position, to the left or right of the centre lane."""
+        """Return the driving lanes at a road position on one side of the centre lane: left or right."""
         lanes = self._driving.get(self._network.section_at(*place), [])
         return frozenset(lane for lane, ident in lanes if (ident > 0) == left)
 
     def _oriented(
         self, lanes: list[tuple[int, int]], orientation: str, reading: str
     ) -> frozenset[int]:
-        """Return the lanes that the orientation of a signal selects: by direction, or by road side."""
+        """Return the lanes that a signal's orientation selects, by their direction or by side of the road."""
         if orientation not in {"+", "-"}:
             return frozenset(lane for lane, _ in lanes)
         plus, about = orientation == "+", self._network.lanes
@@ -382,7 +382,7 @@ def _stops(lanes: frozenset[int], place: tuple[int, float]) -> Stops:
 
 
 def _referred(document: Document, reach: _Reach) -> dict[str, Stops]:
-    """Return the lanes and positions that OpenDRIVE signal references name: signal id → lanes and positions."""
+    """Return the lanes and positions of OpenDRIVE signal references: signal id → its lanes and positions."""
     kind = "road/signalReference"
     table = document[kind]
     s = document.rough_numbers(kind, "s")
@@ -397,7 +397,7 @@ def _referred(document: Document, reach: _Reach) -> dict[str, Stops]:
 
 
 def _limit(attributes: dict[str, str]) -> float:
-    """Return the speed limit of a sign. The default unit is km/h, or mph for codes of the United States."""
+    """Return the speed limit on a sign. Without a unit it is in km/h, or mph for codes of the United States."""
     american = attributes.get("type", "").startswith("R") or attributes.get("country") == "US"
     unit = attributes.get("unit") or ("mph" if american else "km/h")
     return speed(attributes.get("value", ""), unit)

@@ -1,4 +1,4 @@
-"""Conflicts between lanes: lanes in junctions that cross or merge."""
+"""Conflicts between lanes in junctions: lanes that cross or merge."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MOST_PAIRS: Final = 2_000_000
 def conflicts(
     ribbons: Ribbons, lanes: Ints, junction: Sequence[str], flow: tuple[Ints, Ints]
 ) -> tuple[Ints, Ints]:
-    """Return pairs of lanes in a junction that cross or merge.
+    """Return the pairs of lanes in the same junction that cross or merge.
 
     Lanes cross if the interiors of their centre lines meet. They merge if both flow into one lane
     or end in one place. Lanes that start in one place do not conflict, however long they overlap.
@@ -61,7 +61,7 @@ def conflicts(
 
 
 def _pairs(lanes: Ints, junction: Sequence[str]) -> tuple[Ints, Ints]:
-    """Return all pairs of lanes in the same junction, each pair once."""
+    """Return all pairs of lanes in the same junction. Each pair occurs once."""
     names = {name: number for number, name in enumerate(dict.fromkeys(junction))}
     group = np.array([names[name] for name in junction], np.int64)[lanes]
     order = np.lexsort((lanes, group))
@@ -75,7 +75,7 @@ def _pairs(lanes: Ints, junction: Sequence[str]) -> tuple[Ints, Ints]:
 
 
 def _share(src: Ints, dst: Ints, one: Ints, other: Ints) -> Bools:
-    """Return a mask of the pairs of lanes that have a common successor lane."""
+    """Return a mask of the pairs of lanes that have a successor in common."""
     after: dict[int, set[int]] = {}
     for lane, onward in zip(src.tolist(), dst.tolist(), strict=True):
         after.setdefault(lane, set()).add(onward)
@@ -99,7 +99,7 @@ def _together(ribbons: Ribbons, one: Ints, other: Ints, *, at_end: bool) -> Bool
 
 
 def _heights(ribbons: Ribbons, lines: Any, one: Ints, other: Ints) -> Floats:
-    """Return the height difference of each pair of lanes where they are closest; m."""
+    """Return the height difference of each pair of lanes, where the two are closest; m."""
     shortest: Any = shapely.shortest_line(lines[one], lines[other])
     heights: list[Floats] = []
     for lanes, end in ((one, 0), (other, -1)):

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class MapCount:
-    """Number and total length of the parts of a road map of one kind, such as driving lanes.
+    """Number and total length of all map parts of one kind, such as driving lanes.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ def _of(kinds: list[str], kind: str) -> list[int]:
 
 
 def _measured(part: str, lengths: Iterable[tuple[str, float]]) -> list[MapCount]:
-    """Count map parts (such as lanes) by kind, and add up their lengths, longest kind first."""
+    """Count map parts (such as lanes) by kind, with their total length. The longest kind comes first."""
     count: Counter[str] = Counter()
     total: defaultdict[str, float] = defaultdict(float)
     for kind, length in lengths:
@@ -80,7 +80,7 @@ def _measured(part: str, lengths: Iterable[tuple[str, float]]) -> list[MapCount]
 
 
 def _stretches(road_map: RoadMap, kinds: list[str]) -> Iterable[tuple[str, float]]:
-    """Yield road type and length of each part of the roads. The type is empty if it is unknown."""
+    """Yield type and length of each section of a road that has one road type. An unknown type is empty."""
     nodes = road_map.nodes
     for row in _of(kinds, "road"):
         length = float(nodes.length[row])

@@ -35,7 +35,7 @@ _DIGITS: Final = 7
 
 @dataclass(frozen=True, slots=True)
 class LaneCourses:
-    """Table of lane intervals with constant curvature and slope, by lane and start; shape (n,).
+    """Intervals of lanes with constant curvature and slope, sorted by lane and start; shape (n,).
 
     A place before the start of its lane is on the first stretch, a place after the end on the last.
 
@@ -62,12 +62,12 @@ class LaneCourses:
 
     @classmethod
     def none(cls) -> LaneCourses:
-        """Return an empty table of lane curvature and slope."""
+        """Return an empty table of the curvature and slope of lanes."""
         nowhere = np.zeros(0)
         return cls(np.zeros(0, np.int64), nowhere, nowhere, nowhere, nowhere)
 
     def rows(self) -> Iterator[tuple[int, float, float, float]]:
-        """Yield node id of the lane, start, curvature and slope of each lane interval."""
+        """Yield lane (node id), start, curvature and slope of each lane interval."""
         columns = (self.start, self.curvature, self.slope)
         return zip((-2 - self.lane).tolist(), *(one.tolist() for one in columns), strict=True)
 
@@ -107,7 +107,7 @@ class LaneCourses:
 
 
 def _joined(every: LaneCourses) -> LaneCourses:
-    """Join consecutive lane intervals that have the same curvature and slope."""
+    """Join consecutive lane intervals with equal curvature and slope."""
     if not len(every):
         return every
     first = np.flatnonzero(begins(every.lane, every.curvature, np.nan_to_num(every.slope)))

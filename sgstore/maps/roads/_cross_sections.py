@@ -45,7 +45,7 @@ _SWAPPED: Final = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Sections:
-    """Cross sections of a lane along its centre line: centre, left and right points; n rows."""
+    """Cross sections of a lane in n places along it: centre, left and right points."""
 
     left: Floats
     right: Floats
@@ -57,11 +57,11 @@ class Sections:
         object.__setattr__(self, "middle", (self.left + self.right) / 2)
 
     def turned_round(self) -> Sections:
-        """Return the cross sections for the lane in the opposite direction."""
+        """Return the cross sections of the same lane in reverse: order reversed, left and right swapped."""
         return Sections(self.right[::-1], self.left[::-1], self.z[::-1])
 
     def is_crossed(self) -> bool:
-        """Return True if the left border is on the right for more than a metre of the lane."""
+        """Return True if the left border is right of the right border, for more than a metre of the lane."""
         step = np.diff(self.middle, axis=0)
         across = (self.left - self.right)[1:] + (self.left - self.right)[:-1]
         length = np.hypot(*step.T)
@@ -69,7 +69,7 @@ class Sections:
         return bool(length[width < -_SWAPPED * length].sum() > 1.0)
 
     def up_to(self, left: Floats, right: Floats, z: float) -> Sections:
-        """Return the cross sections with one more section added at the end."""
+        """Return the cross sections with one more appended."""
         return Sections(
             np.vstack((self.left, left)), np.vstack((self.right, right)), np.append(self.z, z)
         )
@@ -111,7 +111,7 @@ class Sections:
     def across(
         centre: Floats, lefts: Sequence[Floats], rights: Sequence[Floats], half: float
     ) -> tuple[Sections, bool]:
-        """Compute the cross sections of a lane from its centre line and pieces of its borders.
+        """Compute the cross sections of a lane from its centre line and the lines of its borders.
 
         Parameters
         ----------
@@ -148,7 +148,7 @@ class Sections:
 
 
 def thinned(line: Floats) -> Floats:
-    """Remove points of a line (n, 3) that are too close to the previous point."""
+    """Remove each point of a line (n, 3) that is too close to the point before."""
     if len(line) < 2:
         return line
     step = np.hypot(*np.diff(line[:, :2], axis=0).T)
@@ -166,13 +166,13 @@ def thinned(line: Floats) -> Floats:
 
 
 def run_of(line: Floats) -> Floats:
-    """Return the length of a line from its start to each of its points (n,), seen from above; m."""
+    """Return the length of a line from its start to each point, (n,), without heights; m."""
     return np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))))
 
 
 @dataclass(frozen=True, slots=True)
 class Feet:
-    """Nearest points on lines for some positions, with their distances along the lines.
+    """For some positions, the nearest points on lines, and the distances of these points along the lines.
 
     ``along``: length of the line up to the point, with all lines laid end to end. ``is_end``: True
     at the end of a line.
@@ -184,7 +184,7 @@ class Feet:
 
 
 def feet(places: Floats, lines: Sequence[Floats]) -> Feet:
-    """Return the nearest point on the given lines for each position (n, 2)."""
+    """Return the nearest point on the given lines, for each position (n, 2)."""
     start = np.concatenate([line[:-1, :2] for line in lines])
     way = np.concatenate([line[1:, :2] for line in lines]) - start
     x, y = places.T
@@ -212,12 +212,12 @@ def feet(places: Floats, lines: Sequence[Floats]) -> Feet:
 
 
 def along_line(line: Floats, places: Floats) -> Floats:
-    """Return, for positions (n, 2), the length along a line to the nearest point of the line; m."""
+    """Return the length along a line to the point nearest to each position (n, 2); m."""
     return feet(places, [line]).along
 
 
 def _cuts(run: Floats, more: Sequence[Floats]) -> Floats:
-    """Return the lengths along the centre line of a lane at which it gets cross sections."""
+    """Return the lengths along a lane's centre line at which cross sections are made; m."""
     inner = np.concatenate([run[1:-1], *more])
     own = np.arange(len(inner)) < len(run) - 2
     inside = (inner > APART) & (inner < run[-1] - APART)
@@ -240,7 +240,7 @@ class _Side:
 
 
 def _side(places: Floats, ahead: Floats, aside: Floats, borders: Sequence[Floats]) -> _Side | None:
-    """Return the left or right ends of cross sections of a lane, or ``None`` without a border on this side."""
+    """Return the left or right points of a lane's cross sections; ``None`` if it has no border on this side."""
     if not borders:
         return None
     found = feet(places, borders)
@@ -260,7 +260,7 @@ def _side(places: Floats, ahead: Floats, aside: Floats, borders: Sequence[Floats
 
 
 def half_width(centre: Floats, others: Sequence[Floats]) -> float:
-    """Return half the width of a lane without borders, computed from the distance to its neighbours; m."""
+    """Return half the width of a lane without borders. It is half the distance to its neighbours; m."""
     run = run_of(centre)
     places = np.linspace(0.0, run[-1], _LOOKS)
     middle = np.column_stack([np.interp(places, run, column) for column in centre[:, :2].T])
@@ -278,7 +278,7 @@ def half_width(centre: Floats, others: Sequence[Floats]) -> float:
 def way_between(
     start: tuple[Floats, float, float, float], end: tuple[Floats, float, float, float]
 ) -> Sections:
-    """Return the cross sections of a smooth lane between two lane ends (position, heading, width, height).
+    """Return the cross sections of a smooth lane between two ends (position, heading, width, height).
 
     Its centre line is a cubic; the lengths of its tangents are those of an arc with the same turn.
     """

@@ -21,7 +21,7 @@ TOLERANCE: Final = 0.05
 
 @dataclass(frozen=True, slots=True)
 class DrawnOutlines:
-    """Simplified outlines of a road map (polygons and lines) as plain columns, in painting order.
+    """Simplified outlines of a road map (polygons and lines) as plain columns, in the order to draw them.
 
     Attributes
     ----------

@@ -30,7 +30,7 @@ def touching(
     turn: Floats,
     touch: float,
 ) -> tuple[Ints, Ints, Bools, Floats]:
-    """Return touching pairs of an object footprint and a lane piece, with overlap area and centre mask.
+    """Return pairs of a footprint and a lane piece that touch, common areas, and a mask of centres inside.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def touching(
 
 @compiled
 def _counts_here(cell_x: int, cell_y: int, first: Ints, quad_first: Ints) -> bool:
-    """Return True in one of the grid cells that a footprint and a lane piece share, to count it once."""
+    """Return True in exactly one of the grid cells that a footprint and a lane piece share."""
     if cell_x > first[0] and quad_first[0] != cell_x:
         return False
     return cell_y == first[1] or quad_first[1] == cell_y
@@ -110,7 +110,7 @@ def _counts_here(cell_x: int, cell_y: int, first: Ints, quad_first: Ints) -> boo
 
 @compiled
 def _doubled(pairs: Ints, inside: Bools, measures: Floats) -> tuple[Ints, Bools, Floats]:
-    """Return copies of the result arrays with twice the size."""
+    """Return copies of the result arrays with twice the length."""
     return (
         np.concatenate((pairs, np.empty_like(pairs))),
         np.concatenate((inside, np.empty_like(inside))),
@@ -122,7 +122,7 @@ def _doubled(pairs: Ints, inside: Bools, measures: Floats) -> tuple[Ints, Bools,
 def _to_footprint_axes(
     corners: Floats, shapes: Shapes, row: int, corner_x: Floats, corner_y: Floats
 ) -> None:
-    """Write the corners of a lane piece in the axes of an object footprint into two arrays."""
+    """Convert the corners of a lane piece to the axes of a footprint, and write them into two arrays."""
     x, y, cos, sin, _, _ = shapes
     for corner in range(4):
         dx, dy = corners[corner] - x[row], corners[4 + corner] - y[row]
@@ -134,7 +134,7 @@ def _to_footprint_axes(
 def _meet(
     x: Floats, y: Floats, size: tuple[float, float], turn: float, touch: float
 ) -> tuple[bool, bool]:
-    """Return two flags: footprint and lane piece touch; the footprint's centre is in the piece."""
+    """Return two flags: footprint and lane piece touch, and the footprint's centre is in the piece."""
     a, b = size[0] + touch, size[1] + touch
     if x.min() > a or x.max() < -a or y.min() > b or y.max() < -b:
         return False, False
@@ -151,7 +151,7 @@ def _meet(
 
 @compiled
 def _along_middle(x: Floats, y: Floats) -> tuple[float, float]:
-    """Return the relative position of a footprint along a lane piece, and the squared distance between them."""
+    """Return how far along a lane piece a footprint is (0 to 1), and its squared distance from the line."""
     from_x, from_y = (x[0] + x[3]) / 2, (y[0] + y[3]) / 2
     along_x, along_y = (x[1] + x[2]) / 2 - from_x, (y[1] + y[2]) / 2 - from_y
     share = -(from_x * along_x + from_y * along_y) / max(along_x**2 + along_y**2, 1e-18)
@@ -161,7 +161,7 @@ def _along_middle(x: Floats, y: Floats) -> tuple[float, float]:
 
 @compiled
 def _common_area(corner_x: Floats, corner_y: Floats, size: tuple[float, float]) -> float:
-    """Return the overlap area of an object footprint and a lane piece; m²."""
+    """Return the common area of a footprint and a lane piece; m²."""
     a, b = size
     area = 0.0
     for i in range(4):

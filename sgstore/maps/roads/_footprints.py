@@ -1,4 +1,4 @@
-"""Look-up of the lanes below footprints (ground rectangles) of objects, with overlap and lateral offset.
+"""Look-up of the lanes below footprints (ground rectangles of objects), with common area and lateral offset.
 
 Every frame needs this look-up, so it must be fast. A lane is a chain of quadrangles
 (:class:`~sgstore.maps.roads._ribbons.Ribbons`), short where it bends. A grid brings footprints and
@@ -45,7 +45,7 @@ _MOST_STEPS: Final = 256
 
 @dataclass(frozen=True, slots=True)
 class Touches:
-    """Pairs of an object footprint (ground rectangle) and a lane that it touches; shape (H,).
+    """Pairs of a footprint (ground rectangle of an object) and a lane that it touches; shape (H,).
 
     ``row``, ``lane`` (from 0), ``overlap``, ``offset``, ``heading_error`` as in
     :class:`~sgstore.maps.roads.LaneHits`; ``inside``: True if the footprint's centre is in the lane.
@@ -117,7 +117,7 @@ def _quads(ribbons: Ribbons) -> _Quads:
 
 
 def _unfold(x: Floats, y: Floats) -> None:
-    """Correct twisted pieces of lane surfaces in place. Crossing ends are cut at the crossing point.
+    """Correct twisted pieces of lane surfaces in the given arrays. Crossing ends are cut where they cross.
 
     In a bend that is tighter than the lane is wide, the inner border runs backwards, beyond the
     centre of the bend. This part adds no area to the lane.
@@ -139,7 +139,7 @@ def _unfold(x: Floats, y: Floats) -> None:
 
 
 class _Grid:
-    """Square grid over the map, with the pieces of lane surfaces in each cell."""
+    """Square grid over the map. Each cell has a list of the lane pieces in it."""
 
     def __init__(self, quads: _Quads) -> None:
         low = np.stack((quads.x.min(axis=0), quads.y.min(axis=0)))
@@ -169,7 +169,7 @@ class _Grid:
         return np.floor((places - self.origin) / self.cell).astype(np.int64)
 
     def pairs(self, first: Ints, last: Ints) -> tuple[Ints, Ints]:
-        """Return the lane pieces in rectangles of grid cells, as pairs (rectangle, lane piece).
+        """Return the lane pieces in rectangles of grid cells, as pairs: rectangle, lane piece.
 
         Each pair occurs once: a pair that shares several cells counts in the first of them.
         """
@@ -191,7 +191,7 @@ class _Grid:
 
 
 def _cells_between(first: Ints, last: Ints) -> tuple[Ints, Ints, Ints]:
-    """Return the cells in rectangles of a grid, as pairs (rectangle, cell)."""
+    """Return the cells in rectangles of a grid, as pairs: rectangle, cell."""
     spans = np.maximum(last - first + 1, 0)
     sizes = spans[0] * spans[1]
     row, number = spread(np.zeros_like(sizes), sizes)
@@ -217,7 +217,7 @@ class _Shapes:
 
     @classmethod
     def of(cls, boxes: Floats, z: Floats) -> _Shapes:
-        """Return the footprints of boxes (N, 5). A missing or zero side becomes very short."""
+        """Return the footprints of boxes (N, 5). A side that is missing or zero becomes very short."""
         half = np.maximum(np.nan_to_num(np.abs(boxes[:, 3:5].T)) / 2, TOUCH / 2)
         heading = np.nan_to_num(boxes[:, 2])
         x, y = np.ascontiguousarray(boxes[:, :2].T)
@@ -246,7 +246,7 @@ class LaneIndex:
         return chained([_no_touches(), *(self._gathered(shapes, *touching) for touching in found)])
 
     def _touching(self, shapes: _Shapes) -> tuple[Ints, Ints, Bools, Floats]:
-        """Return touching pairs of a footprint and a lane piece, with overlap area and centre mask."""
+        """Return pairs of a footprint and a lane piece that touch, common areas, and a mask: centre inside."""
         from sgstore.maps.roads import _footprint_loops
 
         grid, quads = self._grid, self._quads
@@ -276,7 +276,7 @@ class LaneIndex:
             )
 
     def _cells(self, shapes: _Shapes) -> tuple[Ints, Ints, Ints]:
-        """Return the footprints with a finite position, and the first and last grid cell of each."""
+        """Return the footprints with a known position, and the first and last grid cell of each."""
         grid = self._grid
         cos, sin = np.abs(shapes.cos), np.abs(shapes.sin)
         reach = np.stack((cos * shapes.a + sin * shapes.b, sin * shapes.a + cos * shapes.b)) + TOUCH
@@ -291,7 +291,7 @@ class LaneIndex:
         return rows, first, last
 
     def _candidates(self, shapes: _Shapes) -> Iterator[tuple[Ints, Ints]]:
-        """Yield pairs of a footprint and a close lane piece without duplicates, in groups of footprints."""
+        """Yield each pair of a footprint and a near lane piece once, for a group of footprints at a time."""
         grid, quads = self._grid, self._quads
         rows, first, last = self._cells(shapes)
         if not len(rows):
@@ -334,7 +334,7 @@ class LaneIndex:
         return Touches(row, lane[best], overlap, offset, error, within)
 
     def _aside(self, shapes: _Shapes, row: Ints, quad: Ints) -> tuple[Floats, Floats]:
-        """Return lateral offset (m) and heading error (rad) of footprints relative to their lanes.
+        """Return the lateral offset (m) and heading error (rad) of footprints relative to lanes they touch.
 
         The offset refers to the place of the lane whose cross section runs through the footprint's
         centre. This place may be in a quadrangle that the footprint does not touch. Between two
@@ -367,7 +367,7 @@ class LaneIndex:
 
 
 def _first_least(values: Floats, starts: Ints) -> Ints:
-    """Return the index of the first minimum in each group of consecutive values."""
+    """Return the index of the first smallest value in each group of consecutive values."""
     least = np.minimum.reduceat(values, starts)
     group = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(values)))
     rows = np.flatnonzero(values == least[group])[::-1]
@@ -383,7 +383,7 @@ def _no_touches() -> Touches:
 
 @dataclass(frozen=True, slots=True)
 class _Pairs:
-    """Pairs of an object footprint and a piece of a lane surface (quadrangle); n pairs."""
+    """Pairs of a footprint and a piece of a lane surface (quadrangle); n pairs."""
 
     row: Ints
     quad: Ints
@@ -405,7 +405,7 @@ class _Pairs:
         return cls(row, quad, shapes.a[row], shapes.b[row], quads.turn[quad], along, across)
 
     def take(self, rows: Ints) -> _Pairs:
-        """Return the pairs of footprint and lane piece with the given indices."""
+        """Return the given pairs of a footprint and a lane piece, by index."""
         return _Pairs(
             self.row[rows],
             self.quad[rows],
@@ -417,7 +417,7 @@ class _Pairs:
         )
 
     def touching(self) -> tuple[Bools, Bools]:
-        """Return two masks: footprint and lane piece touch; the footprint's centre is in the piece."""
+        """Return two masks: footprint and lane piece touch, and the footprint's centre is in the piece."""
         a, b = self.a + TOUCH, self.b + TOUCH
         x, y = self.x, self.y
         apart = (x.min(axis=0) > a) | (x.max(axis=0) < -a)
@@ -432,19 +432,19 @@ class _Pairs:
         return ~apart, inside
 
     def middle_line(self) -> tuple[Floats, Floats, Floats, Floats]:
-        """Return the start of the centre line of each lane piece, and the vector to its end."""
+        """Return the start of each lane piece's centre line, and the vector from there to its end."""
         x, y = (self.x[0] + self.x[3]) / 2, (self.y[0] + self.y[3]) / 2
         return x, y, (self.x[1] + self.x[2]) / 2 - x, (self.y[1] + self.y[2]) / 2 - y
 
     def beside(self) -> tuple[Floats, Floats]:
-        """Return the relative position 0 … 1 of the footprint along the lane piece, and squared distance."""
+        """Return how far along the lane piece the footprint is (0 to 1), and its squared distance."""
         x, y, along_x, along_y = self.middle_line()
         share = -(x * along_x + y * along_y) / np.maximum(along_x**2 + along_y**2, 1e-18)
         at = np.clip(share, 0.0, 1.0)
         return share, (x + at * along_x) ** 2 + (y + at * along_y) ** 2
 
     def between(self) -> Floats:
-        """Return the relative position 0 … 1 of a footprint's centre between both ends of a lane piece.
+        """Return how far a footprint's centre is from the start to the end of a lane piece, 0 to 1.
 
         Unlike the projection, this share continues from quadrangle to quadrangle without a gap or
         overlap.
@@ -456,14 +456,14 @@ class _Pairs:
         return np.where(usable, ahead / np.where(usable, both, 1.0), self.beside()[0])
 
     def _ahead(self, right: int, left: int) -> tuple[Floats, Floats]:
-        """Return the distance of a footprint's centre from one end of a lane piece, and the width there."""
+        """Return how far a footprint's centre is beyond one end of a lane piece, and the width of that end."""
         across_x, across_y = self.x[left] - self.x[right], self.y[left] - self.y[right]
         width = np.hypot(across_x, across_y)
         ahead = self.y[right] * across_x - self.x[right] * across_y
         return ahead / np.maximum(width, _POINT), width
 
     def common_areas(self) -> Floats:
-        """Return the overlap area of footprint and lane piece; m². Clockwise pieces give negative areas.
+        """Return the common area of footprint and lane piece; m². It is negative for a clockwise piece.
 
         The area of a polygon P in the box [-a, a] × [-b, b] is ∮ x̂ dy along P's edges where |y| ≤ b, with
         x̂ = x held within ±a: Green's theorem for the field (x̂, 0). Along an edge the integral of x̂ is a

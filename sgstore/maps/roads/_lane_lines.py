@@ -1,4 +1,4 @@
-"""Conversion of lane lines with links and borders (OSI, CommonRoad, Lanelet2, SUMO) to lanes of a road map.
+"""Conversion of lane lines with links and borders (OSI, CommonRoad, Lanelet2, SUMO) to a road map.
 
 The input is lane lines and links, the output is plain lanes.
 
@@ -62,7 +62,7 @@ _ABOUT: Final = 1.0
 
 
 class Joint(NamedTuple):
-    """Link from a lane end to another lane, with the other lane's end: ``start``, ``end`` or unknown."""
+    """Link from an end of a lane to another lane, and to that lane's end: ``start``, ``end`` or unknown."""
 
     lane: str
     contact: str = ""
@@ -73,7 +73,7 @@ class Joint(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Border:
-    """Line at the left or right side of a lane, with the permission to cross it.
+    """Line on the left or right side of a lane. Crossing it may be permitted.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class Border:
 
 @dataclass(frozen=True, slots=True)
 class LaneLine:
-    """Lane as a centre line with borders and links. Left and right refer to the line, not to the traffic.
+    """Lane as a centre line with borders and links. Left and right are relative to the line, not the traffic.
 
     Attributes
     ----------
@@ -148,7 +148,7 @@ class LaneLine:
 
     @staticmethod
     def with_junctions(lines: Sequence[LaneLine]) -> list[LaneLine]:
-        """Group crossing lanes into junctions, and return the lanes with their junction names.
+        """Group lanes that cross into junctions. Return the lanes with the names of their junctions.
 
         This applies to lanes that cross, diverge and merge, but not to lanes on different storeys.
         Lanes without sections stay unchanged.
@@ -189,7 +189,7 @@ class LaneLine:
 
 @dataclass(frozen=True, slots=True)
 class Area:
-    """Junction as an area: pairs of lanes (from, to) that are connected through it."""
+    """Junction as an area. It has pairs of lanes (from, to) that it connects."""
 
     ident: str
     ways: tuple[tuple[str, str], ...]
@@ -197,7 +197,7 @@ class Area:
 
 @dataclass(slots=True)
 class _Network:
-    """Lanes of a map with surfaces, and look-ups of their ends and directions."""
+    """Lanes of a map with their surfaces, and look-ups of their ends and directions."""
 
     lines: list[LaneLine]
     sections: list[Sections]
@@ -214,7 +214,7 @@ class _Network:
         return middle[0 if contact == Joint.START else -1]
 
     def gap(self, lane: int, end: str, other: int, contact: str) -> float:
-        """Return the distance between an end of one lane and an end of another lane; m."""
+        """Return the distance between an end of a lane and an end of another lane; m."""
         return float(np.hypot(*(self.end_of(lane, end) - self.end_of(other, contact))))
 
     def runs_against(self, lane: int, other: int) -> bool:
@@ -238,7 +238,7 @@ class _Network:
 def plain_lanes(
     lines: Sequence[LaneLine], areas: Sequence[Area] = ()
 ) -> tuple[list[PlainLane], list[str]]:
-    """Convert lane lines to lanes of a road map. Return the lanes, and warnings about guesses.
+    """Convert lane lines to lanes of a road map. Return them, and warnings about guessed values.
 
     Raises
     ------
@@ -311,7 +311,7 @@ def _check_numbers(lines: Sequence[LaneLine], areas: Sequence[Area]) -> None:
 
 
 def _shaped(lines: Sequence[LaneLine]) -> _Network:
-    """Compute the surfaces of lanes from lines. Lanes without a surface are dropped."""
+    """Compute the surfaces of lanes from their lines. Drop lanes without a surface."""
     network = _Network([], [], {})
     usable: list[LaneLine] = []
     short: list[str] = []
@@ -353,12 +353,12 @@ def _cut(line: LaneLine, lines: Sequence[LaneLine], network: _Network) -> tuple[
 
 
 def about_lanes(lanes: Sequence[str], what: str, most: int = LISTED) -> str:
-    """Return a warning text that lists at most ``most`` lanes by name."""
+    """Return a warning text with the names of some lanes, at most ``most``."""
     return f"{'lanes' if len(lanes) > 1 else 'lane'} {first_of(lanes, most)}: {what}"
 
 
 def _report(network: _Network, areas: set[str]) -> None:
-    """Report lanes whose links or neighbours are missing, or whose borders are on the wrong sides."""
+    """Warn about links and neighbours that do not exist, and about borders on the wrong side."""
     missing: list[str] = []
     both: list[str] = []
     for line in network.lines:
@@ -381,7 +381,7 @@ def _tell(network: _Network, lanes: Sequence[str], what: str) -> None:
 
 
 def _add_ways(network: _Network, areas: Iterable[Area]) -> None:
-    """Add lanes through junction areas: each connects the end of one lane with the start of another."""
+    """For each junction area, add lanes that connect the end of one lane with the start of another."""
     missing: list[str] = []
     astray: list[str] = []
     for area in areas:
@@ -403,7 +403,7 @@ def _add_ways(network: _Network, areas: Iterable[Area]) -> None:
 
 
 def _touches(line: LaneLine, area: str, *, at_exit: bool) -> bool:
-    """Return True if traffic of a lane enters or leaves a junction area, or the lane has no links."""
+    """Return True if traffic of a lane enters (or leaves) a junction area, or if the lane has no links."""
     joints = line.after if line.forward == at_exit else line.before
     joints = (*line.before, *line.after) if line.both else joints
     untold = not line.before and not line.after
@@ -436,7 +436,7 @@ def _add_way(network: _Network, area: str, number: int, lanes: tuple[int, int]) 
 
 
 def _gate(network: _Network, lane: int, contact: str) -> tuple[Floats, float, float, float]:
-    """Return position, traffic heading, width and height at one end of a lane."""
+    """Return position, heading of the traffic, width and height at one end of a lane."""
     sections = network.sections[lane]
     at, other = (0, 1) if contact == Joint.START else (-1, -2)
     middle = sections.middle
@@ -489,7 +489,7 @@ def _joints(network: _Network) -> set[_Joined]:
 
 
 def _contact(network: _Network, lane: int, end: str, other: int) -> str:
-    """Return which end (start or end) of another lane touches an end of a lane."""
+    """Return the end (start or end) of another lane that touches the given end of a lane."""
     line, ident = network.lines[other], network.lines[lane].ident
     says = {
         contact
@@ -530,7 +530,7 @@ _Sides = tuple[set[int], set[int]]
 
 
 def _beside(network: _Network) -> list[_Sides]:
-    """Return the left and right neighbours of each lane. It suffices if one of two neighbours has the link."""
+    """Return the left and right neighbours of each lane. A link from one of two neighbours is enough."""
     beside: list[_Sides] = [(set(), set()) for _ in network.lines]
     for row, line in enumerate(network.lines):
         for side, idents in enumerate((line.left_beside, line.right_beside)):
@@ -563,7 +563,7 @@ def _turned_round(one: Floats, other: Floats) -> bool:
 
 
 def _across(network: _Network, beside: list[_Sides], row: int, side: int) -> set[int]:
-    """Return the driving lanes that are separated from a lane only by lanes without traffic."""
+    """Return the next driving lanes on one side of a lane, with only lanes without traffic between them."""
     if network.lines[row].type not in TRAFFIC:
         return set()
     found: set[int] = set()
@@ -583,7 +583,7 @@ def _across(network: _Network, beside: list[_Sides], row: int, side: int) -> set
 
 
 def _against(network: _Network, row: int, others: Iterable[int]) -> Iterator[int]:
-    """Yield the neighbouring lanes with oncoming traffic."""
+    """Yield those neighbours of a lane that have oncoming traffic."""
     if network.lines[row].type not in TRAFFIC:
         return
     for other in others:
@@ -597,7 +597,7 @@ def _against(network: _Network, row: int, others: Iterable[int]) -> Iterator[int
 def _changes(
     network: _Network, row: int, beside: _Sides, against: set[int]
 ) -> Iterator[tuple[int, float, float]]:
-    """Yield the parts of a lane where vehicles may change to a neighbouring lane."""
+    """Yield the parts of a lane from which vehicles may change to a neighbouring lane."""
     line, middle = network.lines[row], network.sections[row].middle
     if line.type not in DRIVING:
         return
@@ -621,7 +621,7 @@ def _changes(
 
 
 def _open_stretches(network: _Network, row: int, side: int) -> list[tuple[float, float]]:
-    """Return the parts of a lane where its border on one side may be crossed."""
+    """Return the parts of a lane where vehicles may cross its border on one side."""
     line, middle = network.lines[row], network.sections[row].middle
     borders = [b for b in (line.lefts, line.rights)[side] if len(b.line) > 1]
     spans: list[tuple[float, float, float, bool]] = []
@@ -644,7 +644,7 @@ def _open_stretches(network: _Network, row: int, side: int) -> list[tuple[float,
 
 
 def _names(network: _Network) -> list[str]:
-    """Return a unique name for each lane. An ambiguous name gets the lane's id as a suffix."""
+    """Return a unique name for each lane. If a name is not unique, the lane's id is appended."""
     wanted = [line.name or line.ident for line in network.lines]
     count = Counter(wanted)
     return [
@@ -654,7 +654,7 @@ def _names(network: _Network) -> list[str]:
 
 
 def _roads(network: _Network, beside: list[_Sides]) -> list[str]:
-    """Return the road of each lane. A lane without a road gets the road of its neighbours."""
+    """Return the name of each lane's road. A lane without a road joins the road of its neighbours."""
     road = [line.road for line in network.lines]
     for row, line in enumerate(network.lines):
         if road[row]:
@@ -670,7 +670,7 @@ def _roads(network: _Network, beside: list[_Sides]) -> list[str]:
 
 
 def _junctions(network: _Network) -> list[str]:
-    """Return the junction of each lane. Lanes that cross or touch form an unnamed junction."""
+    """Return the name of each lane's junction. Lanes that cross or touch get a junction without a name."""
     junction = [line.junction or "" for line in network.lines]
     rows = [row for row, line in enumerate(network.lines) if line.junction is None]
     if not rows:

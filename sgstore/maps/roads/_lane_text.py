@@ -62,7 +62,7 @@ _RELATED: Final = ("onto", "left_beside", "right_beside", "against")
 
 
 def is_lane_text(text: str) -> bool:
-    """Return True if a map text is probably in the lane text format: it begins like a JSON object."""
+    """Return True if a map text begins like a JSON object, and so is probably in the lane text format."""
     return text[:100].lstrip("\ufeff \t\r\n").startswith("{")
 
 
@@ -131,7 +131,7 @@ def _no_number(text: str) -> None:
 
 
 def _fields(lane: PlainLane) -> dict[str, Any]:
-    """Convert a lane to JSON fields, without empty fields."""
+    """Convert a lane to JSON fields. Leave out empty fields."""
     fields: dict[str, Any] = {key: getattr(lane, key) for key in _NAMES}
     fields |= {"section": lane.section, "number": lane.number}
     fields |= {
@@ -148,7 +148,7 @@ def _fields(lane: PlainLane) -> dict[str, Any]:
 
 
 def _signal_fields(signal: PlainSignal) -> dict[str, Any]:
-    """Convert a traffic light or sign to JSON fields, without missing values."""
+    """Convert a traffic light or sign to JSON fields. Leave out missing values."""
     places = {key: round(getattr(signal, key), DIGITS) for key in _POSE}
     told: dict[str, Any] = {key: place for key, place in places.items() if math.isfinite(place)}
     told |= {"name": signal.name, "kind": signal.kind, "lanes": list(signal.lanes)}
@@ -179,7 +179,7 @@ def _text_rows(document: dict[str, Any], what: str, most: int, lanes: int) -> li
 
 
 class _TextRow:
-    """JSON object of a lane or signal, with checked access to its fields."""
+    """JSON object of a lane or signal, whose fields are checked when they are read."""
 
     def __init__(self, fields: dict[str, Any], number: int, lanes: int, what: str) -> None:
         self._fields = fields
@@ -295,7 +295,7 @@ class _TextRow:
         return tuple(values)
 
     def _stretches(self, key: str, numbers: int) -> tuple[tuple[int, float, float], ...]:
-        """Read a JSON list of lane intervals: lane, start, and optionally the end along the lane."""
+        """Read a JSON list of lane intervals: each has a lane, a start, and optionally an end."""
         values = self._fields.get(key, [])
         shape = "[lane, start, end]" if numbers == 3 else "[lane, along]"
         expected = f"at most {MAX_RELATED} stretches {shape}"

@@ -36,7 +36,7 @@ _FIRST_LANE: Final = 1
 
 @dataclass(frozen=True, slots=True)
 class PlainLane:
-    """Lane with cross sections, neighbours and successors, independent of a map format.
+    """Lane with cross sections, neighbours and successors. It does not depend on a map format.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class PlainLane:
     def painted_across(
         lanes: Sequence[PlainLane], lines: Sequence[Floats]
     ) -> list[dict[int, float]]:
-        """Return the driving lanes below painted lines (such as stop lines), with the position along each lane.
+        """Return the driving lanes that painted lines (such as stop lines) cross, and the position along each.
 
         A line between two consecutive lanes belongs to the first.
         """
@@ -113,7 +113,7 @@ class PlainLane:
 
 @dataclass(frozen=True, slots=True)
 class PlainSignal:
-    """Traffic light or sign with its position and lanes, independent of a map format.
+    """Traffic light or sign with its position and lanes. It does not depend on a map format.
 
     Attributes
     ----------
@@ -148,7 +148,7 @@ class PlainSignal:
 
 @dataclass(frozen=True, slots=True)
 class PlainCrosswalk:
-    """Pedestrian crossing with its outline, independent of a map format.
+    """Pedestrian crossing with its outline. It does not depend on a map format.
 
     Attributes
     ----------
@@ -236,14 +236,14 @@ def road_map_of(
 
 
 def _stops(signals: Sequence[PlainSignal], first: int) -> tuple[Ints, Ints, Floats]:
-    """Return the stop positions of traffic lights and signs: signal, lane, and position along the lane."""
+    """Return the stops before traffic lights and signs: node row of the signal, lane, and position along it."""
     rows = [(first + row, *stop) for row, signal in enumerate(signals) for stop in signal.stops]
     column, lane = np.array([one[:2] for one in rows], np.int64).reshape(-1, 2).T
     return column, lane, np.array([along for *_, along in rows], np.float64)
 
 
 def ribbons_of(lanes: Sequence[PlainLane]) -> Ribbons:
-    """Return the surfaces of lanes as one table of cross sections."""
+    """Return the surfaces of lanes, as one table of cross sections."""
     counts = np.array([len(lane.z) for lane in lanes], np.int64)
     offsets = np.concatenate((np.zeros(1, np.int64), np.cumsum(counts)))
     left = np.concatenate([np.zeros((0, 2)), *(lane.left for lane in lanes)])
@@ -275,7 +275,7 @@ def ribbons_of(lanes: Sequence[PlainLane]) -> Ribbons:
 
 
 def headings(x: Floats, y: Floats, first: Bools, alone: Floats | None = None) -> Floats:
-    """Return the heading of polylines at each of their points (N,); rad, not wrapped.
+    """Return the heading of polylines at each of their points, (N,); rad. Angles can exceed ±π.
 
     A line of one point has the heading ``alone``. An inner point has the mean of the directions of
     both pieces, weighted by their lengths; the cubic through points and headings then stays close
@@ -365,7 +365,7 @@ def _crosswalk_nodes(crosswalks: Sequence[PlainCrosswalk]) -> MapNodes:
 
 
 def _object_nodes(objects: Sequence[PlainObject]) -> MapNodes:
-    """Return one map node per object, with the object's smallest bounding box."""
+    """Return one map node per object, with the smallest rectangle around the object."""
     boxes = [shapely.Polygon(one.outline).minimum_rotated_rectangle for one in objects]
     sides = np.array([np.diff(shapely.get_coordinates(box)[:3], axis=0) for box in boxes])
     sides = sides.reshape(-1, 2, 2)
@@ -448,7 +448,7 @@ Edge = tuple[str, "Ints", "Ints"]
 
 
 def edges_of(parts: Sequence[Edge]) -> MapEdges:
-    """Convert edges between node rows to unique, sorted map edges between node ids."""
+    """Convert edges between node rows to map edges between node ids, sorted and without duplicates."""
     code = np.concatenate([np.full(len(src), RELATION_CODE[name]) for name, src, _ in parts])
     src = np.concatenate([s for _, s, _ in parts])
     dst = np.concatenate([d for _, _, d in parts])
@@ -457,7 +457,7 @@ def edges_of(parts: Sequence[Edge]) -> MapEdges:
 
 
 def _spread(groups: Sequence[tuple[int, ...]]) -> Ints:
-    """Return pairs (group index, member) for all members of groups, (n, 2)."""
+    """Return a pair (index of the group, member) for each member of each group, (n, 2)."""
     row = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
     return np.column_stack((row, np.array([*chain(*groups)], np.int64)))
 

@@ -52,7 +52,7 @@ _MOST_AT_ONCE: Final = 1 << 22
 def _downstream(
     lengths: Floats, src: Ints, dst: Ints, limit: float
 ) -> Iterator[tuple[Ints, Ints, Floats]]:
-    """Yield pairs of lanes with their distance, if the second starts within ``limit`` after the first.
+    """Yield pairs of lanes and their distance, if the second starts within ``limit`` after the first ends.
 
     Traffic flows from ``src`` to ``dst``. The fronts of all lanes advance together, lane by lane.
     """
@@ -111,7 +111,7 @@ _MERGED: Final = " without sections"
 
 @dataclass(frozen=True, slots=True)
 class MapNodes:
-    """All parts of a road map (lanes, roads, signals, …) as columns. Row i has node id -1 - i.
+    """All parts of a road map (lanes, roads, signals, …) as columns. Row ``i`` has the node id ``-1 - i``.
 
     Attributes
     ----------
@@ -157,7 +157,7 @@ class MapNodes:
 
     @classmethod
     def of(cls, kind: str | Sequence[str], name: Sequence[str], **columns: Any) -> MapNodes:
-        """Return a table of map parts from columns. Missing columns are empty, 0 or NaN.
+        """Create a table of map parts from columns. Missing columns become empty texts, 0 or NaN.
 
         ``kind``: one, or one per node.
         """
@@ -179,7 +179,7 @@ class MapNodes:
         return taken(self, rows)
 
     def first_sections(self) -> Ints:
-        """Return, for each lane, the row of the first lane section with the same road and lane number."""
+        """For each map part, return the row that represents it: for a lane, the row of its first section."""
         same = np.arange(len(self))
         first: dict[tuple[str, int], int] = {}
         for column in np.flatnonzero(self.kind == KIND_CODE["lane"]).tolist():
@@ -191,7 +191,7 @@ class MapNodes:
 
 @dataclass(frozen=True, slots=True)
 class MapEdges:
-    """Edges between the parts of a road map (such as successor or neighbour); shape (E,).
+    """Edges between the parts of a road map, such as successor or neighbour; shape (E,).
 
     Attributes
     ----------
@@ -211,7 +211,7 @@ class MapEdges:
 
 @dataclass(frozen=True, slots=True)
 class LaneHits:
-    """Pairs of an object footprint and a lane that it touches, sorted by footprint; shape (H,).
+    """Pairs of a footprint and a lane that it touches, sorted by footprint; shape (H,).
 
     Attributes
     ----------
@@ -241,7 +241,7 @@ class LaneHits:
 
 @dataclass(frozen=True, slots=True)
 class LaneChanges:
-    """Parts of lanes where vehicles may change to a neighbouring lane; shape (n,).
+    """Parts of lanes from which vehicles may change to a neighbouring lane; shape (n,).
 
     Attributes
     ----------
@@ -350,19 +350,19 @@ class RoadMap:
         self._ways: tuple[float, tuple[Ints, Ints, Floats]] | None = None
 
     def outlines(self) -> Geometries:
-        """Return shapely polygons, lines or points of all map parts (K,); ``None`` for parts without a shape.
+        """Return the shapely polygon, line or point of each map part, (K,); ``None`` for parts without a shape.
 
         Roads, junctions and ``off_road`` have no shape: a road consists of its lanes.
         """
         return self._outlines.copy()
 
     def surface_of(self, lanes: Ints, distance: float) -> LaneSurface:
-        """Return the area around some lanes (counted from 0), up to a distance; m."""
+        """Return the area within a distance of some lanes (counted from 0); m."""
         with PREPARED:
             return LaneSurface(self._outlines[1 + lanes], distance)
 
     def lanes_of(self, boxes: Floats, z: Floats) -> LaneHits:
-        """Return the lanes that footprints (ground rectangles of objects) touch at their height.
+        """Return the lanes that footprints (ground rectangles of objects) touch. Heights are compared, too.
 
         Parameters
         ----------
@@ -395,7 +395,7 @@ class RoadMap:
         )
 
     def crosswalks_of(self, boxes: Floats, z: Floats) -> tuple[Ints, Ints]:
-        """Return the crosswalks below object footprints, as pairs of footprint index and node id.
+        """Return the crosswalks below footprints, as pairs: index of the footprint, node id.
 
         Boxes and heights as in :meth:`lanes_of`.
         """
@@ -415,7 +415,7 @@ class RoadMap:
         return row[order], -1 - column[order]
 
     def near(self, x: Floats, y: Floats, radius: float) -> tuple[Ints, Ints]:
-        """Return the map parts within ``radius`` of points, as pairs of point index and node id.
+        """Return the map parts within ``radius`` of points, as pairs: index of the point, node id.
 
         A road or junction is near if one of its lanes is near. Ordered by row and by descending
         node id.
@@ -457,7 +457,7 @@ class RoadMap:
         return present
 
     def near_shapes(self, corners: Floats, distance: float) -> tuple[Ints, Ints]:
-        """Return the map parts within a distance of shapes, as pairs of shape index and node id.
+        """Return the map parts within a distance of shapes, as pairs: index of the shape, node id.
 
         Parameters
         ----------
@@ -478,7 +478,7 @@ class RoadMap:
         return row[order], -1 - columns[place][order]
 
     def lanes_of_signal(self, signal: str) -> Ints:
-        """Return node ids of the driving lanes that a traffic signal applies to; empty for an unknown id.
+        """Return the node ids of the driving lanes to which a traffic signal applies; empty for an unknown id.
 
         For a signal that is missing in the map, :meth:`lanes_ref` can replace its id.
         """
@@ -505,7 +505,7 @@ class RoadMap:
 
     @cached_property
     def without_sections(self) -> RoadMap:
-        """Return the map with one node per lane, in which all sections of the lane are merged.
+        """Return the map with the sections of each lane merged into a single node.
 
         The node is the one of the first section, with the name ``road_number``. The other nodes
         stay, without edges; node ids keep their meaning. Surface queries still distinguish
@@ -531,7 +531,7 @@ class RoadMap:
         )
 
     def downstream(self, limit: float) -> tuple[Ints, Ints, Floats]:
-        """Return pairs of lanes where the second starts at most ``limit`` metres after the end of the first.
+        """Return pairs of lanes: the second starts at most ``limit`` metres after the end of the first.
 
         The last result is cached: a second call with the same limit is free.
 
@@ -553,7 +553,7 @@ class RoadMap:
 
     @cached_property
     def reach(self) -> tuple[Ints, Ints, Floats]:
-        """Return pairs of lanes connected along the driving direction, with the distance of their starts.
+        """Return pairs of lanes that traffic connects, and the distance from one start to the other.
 
         Returns
         -------
@@ -581,7 +581,7 @@ class RoadMap:
 
     @cached_property
     def places(self) -> MapPlaces:
-        """Parts of lanes covered by junctions, crosswalks, signals, zones and so on.
+        """Intervals of lanes that map parts cover: junctions, crosswalks, signals, zones and so on.
 
         Empty for a map without sections, as :attr:`reach`.
         """
@@ -625,7 +625,7 @@ class RoadMap:
         return MapPlaces.of(table.part, table.what, table.lane, table.start, table.end)
 
     def _on_roundabouts(self) -> MapPlaces:
-        """Return the lanes of each roundabout as intervals along these lanes."""
+        """Return the lanes of each roundabout, as intervals of these lanes."""
         (lane, road), (part, whole) = self._containment
         around = np.flatnonzero(self.nodes.kind[whole] == KIND_CODE["roundabout"])
         of_road: dict[int, list[int]] = {}
@@ -676,7 +676,7 @@ class RoadMap:
 
     @cached_property
     def _crosswalks(self) -> tuple[Ints, shapely.STRtree, Ints | None]:
-        """Crosswalks of the map: rows, a spatial index, and the grid cells near them.
+        """Crosswalks of the map: their rows, a spatial index, and grid cells near them.
 
         The cells are ``None`` if there are too many.
         """
@@ -694,7 +694,7 @@ class RoadMap:
 
     @cached_property
     def _corners(self) -> tuple[Floats, Floats]:
-        """Bounding boxes (M, 4) of map parts, and some corners (M, C, 2) of their shapes; m."""
+        """Bounding boxes (M, 4) of map parts, and a few corners (M, C, 2) of each shape; m."""
         _, tree = self._extents
         every, shape = shapely.get_coordinates(tree.geometries, return_index=True)
         count = np.bincount(shape, minlength=len(tree.geometries))
@@ -713,7 +713,7 @@ class RoadMap:
 
     @cached_property
     def _containment(self) -> tuple[tuple[Ints, Ints], ...]:
-        """Pairs of a map part and the part that contains it: lane in road, road in junction."""
+        """Pairs of a map part and the part that contains it: lane and road, road and junction."""
         inside = self.edges.relation == RELATION_CODE["isIn"]
         child, parent = -1 - self.edges.src[inside], -1 - self.edges.dst[inside]
         lane = self.nodes.kind[child] == KIND_CODE["lane"]
@@ -727,7 +727,7 @@ class RoadMap:
 
     @staticmethod
     def lanes_ref(names: Iterable[str]) -> str:
-        """Return an id made of lane names for a traffic signal that the map does not contain."""
+        """For a traffic signal that is not in the map, return an id that lists the names of its lanes."""
         return _LANES_REF + json.dumps(list(names), ensure_ascii=False)
 
     @staticmethod
@@ -737,7 +737,7 @@ class RoadMap:
 
     @staticmethod
     def point_shapes(x: Floats, y: Floats) -> NDArray[np.object_]:
-        """Convert coordinates to shapely points, (N,)."""
+        """Convert coordinates to shapely points, (N,) each."""
         points: Any = shapely.points(np.column_stack([x, y]))
         return points
 
@@ -754,7 +754,7 @@ def _names_in(ref: str) -> set[str]:
 
 
 def merged_edges(edges: MapEdges, same: Ints) -> MapEdges:
-    """Return unique map edges between lanes, after the sections of each lane are merged."""
+    """Return the map edges after the sections of each lane were merged, without duplicates."""
     src, dst = -1 - same[-1 - edges.src], -1 - same[-1 - edges.dst]
     table = np.column_stack([edges.relation.astype(np.int64), src, dst])[src != dst]
     relation, src, dst = np.unique(table, axis=0).reshape(-1, 3).T
@@ -770,12 +770,12 @@ def _floor(places: Floats) -> Ints:
 
 
 def _numbered(cells: Ints) -> Ints:
-    """Return a number for each grid square (N, 2). A few squares may share a number."""
+    """Return a number for each grid square, (N,). Rarely, two squares have the same number."""
     return cells[:, 0] << 32 ^ cells[:, 1]
 
 
 def _rectangles(boxes: Floats) -> Geometries:
-    """Convert object footprints to shapely polygons. A missing or zero side becomes 0.1 mm long."""
+    """Convert footprints to shapely polygons. A side that is missing or zero becomes 0.1 mm long."""
     half = np.maximum(np.nan_to_num(np.abs(boxes[:, 3:5])) / 2, 5e-5)
     heading = np.nan_to_num(boxes[:, 2])
     cos, sin = np.cos(heading)[:, None], np.sin(heading)[:, None]

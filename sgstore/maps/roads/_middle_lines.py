@@ -1,4 +1,4 @@
-"""Centre line of a lane that is described only by its left and right border."""
+"""Centre line of a lane, computed from its left and right border."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def middle_between(lefts: Sequence[Floats], rights: Sequence[Floats]) -> Floats:
 
 
 def _joined_pieces(pieces: Sequence[Floats], side: str) -> Floats:
-    """Join the pieces of a lane border, starting from the longest, each time with the nearest end."""
+    """Join the pieces of a lane border: first the longest, then always the one with the nearest end."""
     free = [thin for piece in pieces if len(thin := thinned(piece)) > 1 and run_of(thin)[-1] > 0]
     if not free:
         raise ValueError(f"neither a centre line nor a boundary to its {side}")
@@ -90,7 +90,7 @@ def _joined_pieces(pieces: Sequence[Floats], side: str) -> Floats:
 
 
 def _is_parallel(piece: Floats, chain: Floats) -> bool:
-    """Return True if the midpoint of a piece is close to the joined pieces, as in a double line."""
+    """Return True if the middle of a piece is close to the joined pieces, as in a double line."""
     run = run_of(piece)
     midpoint = np.array([[np.interp(run[-1] / 2, run, column) for column in piece[:, :2].T]])
     foot = feet(midpoint, [chain])
@@ -98,7 +98,7 @@ def _is_parallel(piece: Floats, chain: Floats) -> bool:
 
 
 def _cut_back(line: Floats, other: Floats, end: int) -> Floats:
-    """Cut the part of a lane border that extends beyond the end of the other border."""
+    """Shorten a lane border at one end if it extends beyond the end of the other border."""
     run = run_of(line)
     foot = feet(other[[end], :2], [line])
     along, gap = float(foot.along[0]), float(np.hypot(*(foot.at[0] - other[end, :2])))

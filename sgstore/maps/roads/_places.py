@@ -33,7 +33,7 @@ BROAD_LINES: Final = ("broad_line_left", "broad_line_right")
 
 @dataclass(frozen=True, slots=True)
 class MapPlaces:
-    """Intervals of lanes covered by map parts (junctions, crosswalks, signals, …); shape (n,).
+    """Intervals of lanes that map parts (junctions, crosswalks, signals, …) cover; shape (n,).
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class MapPlaces:
         return len(self.part)
 
     def rows(self) -> Iterator[tuple[int, str, int, float, float]]:
-        """Yield each lane interval as (map node id, kind, lane node id, start, end)."""
+        """Yield for each interval: node id of the map part, kind, node id of the lane, start, end."""
         # Map node c has the id -1 - c, and the lanes follow the first node of a map.
         parts, lanes = (-1 - self.part).tolist(), (-2 - self.lane).tolist()
         return zip(parts, self.what, lanes, self.start.tolist(), self.end.tolist(), strict=True)
@@ -72,14 +72,14 @@ class MapPlaces:
     def of(
         cls, part: Ints, what: Sequence[str], lane: Ints, start: Floats, end: Floats
     ) -> MapPlaces:
-        """Return a sorted table of lane intervals from columns in any order."""
+        """Return a table of lane intervals, sorted, from columns in any order."""
         order = np.lexsort((end, start, lane, part))
         kinds = tuple(what[int(row)] for row in order)
         return cls(part[order], kinds, lane[order], start[order], end[order])
 
     @classmethod
     def of_broad_lines(cls, rows: Sequence[tuple[int, bool, float, float]]) -> MapPlaces:
-        """Return a table of lane intervals with broad markings.
+        """Return a table with the intervals of lanes that have broad markings.
 
         A row is the lane, True if the marking is on its left, and start and end; m.
         """
@@ -92,7 +92,7 @@ class MapPlaces:
 def whole_lanes(
     ribbons: Ribbons, what: str, names: Sequence[str], column: dict[str, int]
 ) -> MapPlaces:
-    """Return lane intervals that cover whole lanes, for their road or junction.
+    """Return intervals that cover whole lanes, one for each lane that belongs to a road or junction.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ def whole_lanes(
 def crosswalk_places(
     ribbons: Ribbons, columns: Ints, shapes: Any, z: Floats, storey: float
 ) -> MapPlaces:
-    """Return, for each crosswalk, the intervals of the lanes that it crosses.
+    """Return the intervals of lanes that each crosswalk crosses.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def crosswalk_places(
 
 
 def _curve_lengths(ribbons: Ribbons, lane: Ints, along: Floats) -> Floats:
-    """Convert lengths along straight pieces of a line to lengths along curved centre lines; m."""
+    """Convert lengths measured along straight pieces to lengths along curved centre lines; m."""
     x, y = (ribbons.left_x + ribbons.right_x) / 2, (ribbons.left_y + ribbons.right_y) / 2
     lengths = np.empty(len(lane))
     for row in np.unique(lane).tolist():
@@ -168,7 +168,7 @@ def signal_places(
     applies: tuple[Ints, Ints],
     stops: tuple[Ints, Ints, Floats],
 ) -> MapPlaces:
-    """Return the positions of traffic signals along the lanes that they apply to.
+    """Return the positions of traffic signals along the lanes to which they apply.
 
     Parameters
     ----------

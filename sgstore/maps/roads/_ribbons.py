@@ -59,7 +59,7 @@ class Ribbons:
         return len(self.offsets) - 1
 
     def followed_by(self, more: Ribbons) -> Ribbons:
-        """Return the lane surfaces with those of more lanes appended."""
+        """Return the lane surfaces, with the surfaces of more lanes appended."""
         offsets = np.concatenate((self.offsets, self.offsets[-1] + more.offsets[1:]))
         return replace(chained([self, more]), offsets=offsets)
 
@@ -75,7 +75,7 @@ class Ribbons:
 
     @property
     def bends(self) -> Floats:
-        """Angle between each cross section and the next along the centre line, (S,); rad.
+        """Angle from each cross section to the next one of the lane, (S,); rad.
 
         0 where the lane jumps, and at its end.
         """
@@ -87,7 +87,7 @@ class Ribbons:
         return bend
 
     def between(self, lane: Ints, along: Floats, column: Floats) -> Floats:
-        """Interpolate a column of cross sections, or a stack of columns, at positions along lanes.
+        """Interpolate one or more columns of the cross sections at positions along lanes.
 
         ``lane`` and ``along`` as in :meth:`at`.
         """
@@ -99,7 +99,7 @@ class Ribbons:
         return self.between(lane, along, self.z)
 
     def at(self, lane: Ints, along: Floats) -> LanePoints:
-        """Return points on centre lines (position, heading) at given positions along lanes.
+        """Return points on centre lines (position, heading), at given positions along lanes.
 
         Parameters
         ----------
@@ -136,7 +136,7 @@ class Ribbons:
         )
 
     def _turns(self, before: Ints) -> tuple[Floats, Floats, tuple[Floats, Floats]]:
-        """Return the headings at both ends of centre line pieces relative to their chord, and the chords."""
+        """Return the headings at both ends of centre line pieces, relative to their chords, and the chords."""
         after = before + 1
         x, y = (self.left_x + self.right_x) / 2, (self.left_y + self.right_y) / 2
         way = x[after] - x[before], y[after] - y[before]
@@ -153,7 +153,7 @@ class Ribbons:
     def _place(
         self, column: Floats, sign: Floats, lane: Ints, value: Floats
     ) -> tuple[Ints, Floats]:
-        """Return the cross section before each position on a lane, and the relative position to the next one.
+        """Return the cross section before each position on a lane, and the share of the way to the next one.
 
         ``column`` rises along lanes where ``sign`` is 1 and falls where it is -1. All lanes are
         searched at once, laid end to end with gaps of 1 m.
@@ -180,7 +180,7 @@ class Ribbons:
         return np.where(total > 0, weighted / np.where(total > 0, total, 1.0), plain)
 
     def turned(self) -> Floats:
-        """Return the heading change of each lane from start to end, positive to the left, (L,); rad."""
+        """Return how much each lane turns from start to end, positive to the left, (L,); rad."""
         bend = wrapped(np.diff(self.heading, append=0.0))
         bend[self.offsets[1:] - 1] = 0.0
         return np.add.reduceat(bend, self.offsets[:-1])
@@ -221,7 +221,7 @@ class LanePoints:
 
 
 def _is_smooth(first: Floats, last: Floats) -> Bools:
-    """Return True for pieces of a line without a jump: both end headings are within 1 rad of the chord."""
+    """Return a mask of centre line pieces without a jump: both end headings are within 1 rad of the chord."""
     return (np.abs(first) < 1) & (np.abs(last) < 1)
 
 
@@ -246,14 +246,14 @@ def waypoints(ribbons: Ribbons, spacing: float) -> LanePoints:
 
 
 def centre_lines(ribbons: Ribbons) -> NDArray[Any]:
-    """Return the centre lines of all lanes as shapely lines, (L,)."""
+    """Return the centre line of each lane as a shapely line, (L,)."""
     x, y = (ribbons.left_x + ribbons.right_x) / 2, (ribbons.left_y + ribbons.right_y) / 2
     lines: Any = shapely.linestrings(np.column_stack((x, y)), indices=ribbons.lane)
     return lines
 
 
 def lane_polygons(ribbons: Ribbons) -> NDArray[Any]:
-    """Return the surfaces of all lanes as shapely polygons, (L,)."""
+    """Return the surface of each lane as a shapely polygon, (L,)."""
     counts = np.diff(ribbons.offsets)
     lane = ribbons.lane
     number = np.arange(len(lane)) - ribbons.offsets[lane]
@@ -270,7 +270,7 @@ def lane_polygons(ribbons: Ribbons) -> NDArray[Any]:
 
 
 class LaneSurface:
-    """Surroundings of some lanes: the points within a distance of their surfaces.
+    """Surroundings of some lanes: all points within a distance of the lanes' surfaces.
 
     Parameters
     ----------
@@ -288,7 +288,7 @@ class LaneSurface:
         self._boxes = shapely.STRtree(shapely.box(*(shapely.bounds(self._parts) + around).T))
 
     def near(self, x: Floats, y: Floats) -> Bools:
-        """Return a mask of the points within the distance."""
+        """Return a mask of the points that are within the distance of the lanes."""
         points: Any = shapely.points(x, y)
         row, part = self._boxes.query(points)
         near = np.zeros(len(x), np.bool_)

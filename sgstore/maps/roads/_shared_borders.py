@@ -1,4 +1,4 @@
-"""Neighbouring lanes that share a border, for formats that name borders instead of neighbours."""
+"""Neighbours of lanes that share a border, for map formats that name borders but no neighbours."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ _LaneSide: TypeAlias = "tuple[int, int]"
 
 @dataclass(frozen=True, slots=True)
 class _Stretch:
-    """Part of a border that belongs to a lane: start and end along the border (m), and the side of the lane."""
+    """Part of a border that a lane uses: its start and end along the border (m), and the lane's side."""
 
     start: float
     end: float
     left_of_border: bool
 
     def is_opposite(self, other: _Stretch) -> bool:
-        """Return True if two lanes are on the two sides of a common part of the border."""
+        """Return True if two lanes lie on different sides of a common part of the border."""
         common = min(self.end, other.end) - max(self.start, other.start)
         shorter = min(self.end - self.start, other.end - other.start)
         across = self.left_of_border != other.left_of_border
@@ -43,7 +43,7 @@ class _Stretch:
 
 
 def with_shared_borders(lines: Sequence[LaneLine]) -> list[LaneLine]:
-    """Add missing neighbours: lanes that share a border become neighbours. Return the changed lanes.
+    """Make lanes that share a border neighbours of each other. Return the changed lanes.
 
     Two lanes share a border if they are on its two sides, along the same part of it. A side with a
     neighbour from the source stays unchanged.
@@ -73,7 +73,7 @@ def with_shared_borders(lines: Sequence[LaneLine]) -> list[LaneLine]:
 
 
 def _borders_by_name(lines: Sequence[LaneLine]) -> dict[str, dict[_LaneSide, Floats]]:
-    """Return the line of each named border, for each lane side that uses it."""
+    """Return the line of each named border for each lane that uses it: border → (lane, side) → line."""
     borders: dict[str, dict[_LaneSide, Floats]] = defaultdict(dict)
     for row, line in enumerate(lines):
         if len(thinned(line.centre)) < 2:
@@ -91,7 +91,7 @@ def _has_neighbour(lines: Sequence[LaneLine], lane_side: _LaneSide) -> bool:
 
 
 def _stretch(centre: Floats, border: Floats) -> _Stretch:
-    """Return the part of a border that belongs to a lane. Beyond the border's ends, it has no length."""
+    """Return the part of a border that a lane uses. It has no length if the lane is beyond the border."""
     centre, border = thinned(centre)[:, :2], border[:, :2]
     on_lane, on_border = _sampled(centre), _sampled(border)
     onto, back = feet(on_lane, [border]), feet(on_border, [centre])
@@ -107,11 +107,11 @@ def _stretch(centre: Floats, border: Floats) -> _Stretch:
 
 
 def _stations(line: Floats) -> Floats:
-    """Return equal distances along a line, from its start to its end; m."""
+    """Return lengths at equal distances along a line, from its start to its end; m."""
     return run_of(line)[-1] * np.linspace(0.0, 1.0, _SAMPLES)
 
 
 def _sampled(line: Floats) -> Floats:
-    """Return the positions (n, 2) at equal distances along a line."""
+    """Return the positions (n, 2) of points at equal distances along a line."""
     run, stations = run_of(line), _stations(line)
     return np.column_stack([np.interp(stations, run, column) for column in line[:, :2].T])

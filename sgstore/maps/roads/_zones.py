@@ -48,7 +48,7 @@ def zones(
     flow: tuple[Ints, Ints],
     beside: tuple[Ints, Ints],
 ) -> MapPlaces:
-    """Return the merge and departure zones (near on-ramps and off-ramps) as intervals of lanes.
+    """Return the merge and departure zones (near on-ramps and off-ramps), as intervals of lanes.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def zones(
 
 @dataclass(frozen=True, slots=True)
 class _Lanes:
-    """Driving lanes with lengths, successors, predecessors and groups of neighbours."""
+    """Driving lanes with their lengths, successors, predecessors, and groups of neighbouring lanes."""
 
     types: Sequence[str]
     inside: Sequence[bool]
@@ -92,11 +92,11 @@ class _Lanes:
     group: Sequence[int]
 
     def turned(self) -> _Lanes:
-        """Return the lanes with the driving direction reversed: successors become predecessors."""
+        """Return the lanes in reverse driving direction: successors become predecessors."""
         return replace(self, after=self.before, before=self.after)
 
     def reaches(self, leading: frozenset[str]) -> dict[int, float]:
-        """Return the lanes in a merge zone: lane → length of the zone at the lane's end; m."""
+        """Return the lanes in a merge zone, each with the length of the zone before its end: lane → m."""
         groups: dict[int, list[int]] = {}
         for lane, of in enumerate(self.group):
             if self.types[lane] in DRIVING:
@@ -132,7 +132,7 @@ class _Lanes:
                 yield from last[target]
 
     def _onto(self, lane: int) -> Iterable[tuple[int, int]]:
-        """Yield the lane groups after the next junction of a lane, with the last lane before each group."""
+        """Yield the lane groups after the next junction, each with the last lane before it."""
         queue, seen = [lane], {lane}
         while queue and len(seen) < _MOST:
             at = queue.pop()
@@ -146,7 +146,7 @@ class _Lanes:
     def _walk_back(
         self, lane: int, groups: Mapping[int, Sequence[int]], found: dict[int, float]
     ) -> None:
-        """Add a lane, its neighbours and predecessors to a merge zone, up to the largest length of the zone."""
+        """Add a lane, its neighbours and the lanes before them to a merge zone, up to its largest length."""
         queue = [(lane, LONG)]
         while queue:
             at, left = queue.pop()
@@ -161,7 +161,7 @@ class _Lanes:
 
 
 def _related(count: int, pairs: tuple[Ints, Ints], traffic: Sequence[bool]) -> list[list[int]]:
-    """Return the related lanes (such as successors) of each lane, for driving lanes only."""
+    """Return lanes related to each lane (such as successors), as lists. Only driving lanes count."""
     found: list[list[int]] = [[] for _ in range(count)]
     for one, other in zip(*(column.tolist() for column in pairs), strict=True):
         if traffic[one] and traffic[other]:
@@ -170,7 +170,7 @@ def _related(count: int, pairs: tuple[Ints, Ints], traffic: Sequence[bool]) -> l
 
 
 def _groups(beside: Sequence[Sequence[int]]) -> list[int]:
-    """Return the group number of each lane. Neighbouring lanes are in one group."""
+    """Return the group number of each lane. Neighbouring lanes have the same number."""
     group = [-1] * len(beside)
     for first in range(len(beside)):
         queue = [first] if group[first] < 0 else []
