@@ -38,7 +38,7 @@ def arrow() -> Any:
 
 
 def read_arrow_file(path: Path, columns: Iterable[str], lose: Callable[[str], None]) -> Any:
-    """Return the named columns of an Arrow file as a table. Unreadable batches count as lost.
+    """Return the given columns of an Arrow file as a table. Batches that are unreadable count as lost.
 
     Parameters
     ----------

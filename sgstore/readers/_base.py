@@ -1,4 +1,4 @@
-"""Base classes of all readers of recordings: the first pass over the messages, and the open recording.
+"""Base classes of all readers of recordings: the first reading of the messages, and the open recording.
 
 A flavour (a format of recordings) has three classes. Its :class:`Survey` reads a recording once and collects
 the facts that are needed before the first frame. Its :class:`~sgstore.readers._blocks.MessageDecoder` converts
@@ -56,7 +56,7 @@ Ref = tuple[int, int, int, int, int]
 
 
 def ref_of(run: Messages, row: int) -> Ref:
-    """Return the file position of one message: channel id, log time, chunk offset, offset and length."""
+    """Return the file position of a message: channel id, log time, chunk offset, offset and length."""
     return (
         int(run.channel[row]),
         int(run.log_time_ns[row]),
@@ -98,7 +98,7 @@ def channels_of(recording: Recording, role: Callable[[int], str]) -> tuple[Chann
 def frame_refs(
     channels: tuple[Channel, ...], window: tuple[int, int]
 ) -> Callable[[Messages], MessageRefs]:
-    """Return a function that selects the file positions of the messages that belong to frames.
+    """Return a function that returns the file positions of those messages that belong to frames.
 
     Parameters
     ----------
@@ -143,20 +143,20 @@ BEGINNING: Final = 1_000_000_000
 
 
 def count_ref(told: dict[Key, tuple[int, Ref]], key: Key, ref: Ref, times: int = 1) -> int:
-    """Increase the counter of a key, and store the position of its first message. Return the old count."""
+    """Count an item with a given key, and store the position of the first one. Return the count before."""
     before, first = told.get(key, (0, ref))
     told[key] = before + times, first
     return before
 
 
 def listing(things: Sequence[str]) -> str:
-    """Return a text that lists the possible egos of a recording, for an error message."""
+    """Return a text that lists possible egos of a recording, for an error message."""
     return f"there are: {first_of(things, LISTED) or 'none'}"
 
 
 @dataclass(slots=True)
 class Lead:
-    """Channel that may contain the frames of a trace, with counts of its content.
+    """Channel that may contain the frames of a trace. It has counts of its content.
 
     Attributes
     ----------
@@ -180,7 +180,7 @@ AnyLead = TypeVar("AnyLead", bound=Lead)
 
 
 class Survey(Generic[AnyLead]):
-    """First pass over the messages of a recording, which collects the facts that its frames need.
+    """First reading of all messages of a recording. It collects information that the frames need.
 
     Unreadable messages are reported later, during the reading of the frames.
 
@@ -223,14 +223,14 @@ class Survey(Generic[AnyLead]):
         self._window = recording.window
 
     def meet(self, channel: int) -> bool:
-        """Return True if a channel contains frames, or facts (such as actor lists) for later frames.
+        """Return True if a channel contains frames, or data for later frames, such as actor lists.
 
         It is called once per channel, before its first message is examined.
         """
         raise NotImplementedError
 
     def watches(self, channel: int, *, met: bool) -> bool:
-        """Return True if the first pass must examine the messages of a channel.
+        """Return True if the first reading of the recording must examine the messages of a channel.
 
         ``met`` is the result of :meth:`meet`. The method is called for each run of messages. A result of
         ``False`` is final.
@@ -239,19 +239,19 @@ class Survey(Generic[AnyLead]):
         return met
 
     def keeps(self, channel: int) -> bool:
-        """Return True if the second pass, which builds the frames, needs the messages of a channel."""
+        """Return True if messages of a channel are needed in the second reading, which makes the frames."""
         raise NotImplementedError
 
     def look(self, run: Messages, row: int) -> None:
-        """Collect facts from one message in the first pass over a recording."""
+        """Collect information from a message, in the first reading of a recording."""
         raise NotImplementedError
 
     def rank(self, lead: AnyLead) -> tuple[int, ...]:
-        """Return the sort key of a channel for the choice of the frame channel. The greatest key wins."""
+        """Return the sort key of a channel. The channel with the greatest key becomes the frame channel."""
         return lead.weight, lead.frames
 
     def read(self) -> Self:
-        """Read all messages of the recording once, collect the facts, and return this object.
+        """Read all messages of the recording once and collect information. Return this object.
 
         Raises
         ------
@@ -280,7 +280,7 @@ class Survey(Generic[AnyLead]):
     def _look_through(
         self, run: Messages, watched: NDArray[np.bool_], firsts: list[tuple[int, int]]
     ) -> None:
-        """Collect facts from a group of messages. Each new channel is classified at its first message."""
+        """Collect information from a group of messages. A channel is classified at its first message."""
         start = 0
         for stop, channel in [*firsts, (len(run), -1)]:
             for row in np.flatnonzero(watched[run.channel[start:stop]]).tolist():
@@ -291,13 +291,13 @@ class Survey(Generic[AnyLead]):
                 watched[channel] = self.watches(channel, met=met)
 
     def see_stamp(self, run: Messages, row: int, stamp_ns: int | None) -> None:
-        """Record the time stamp of a message that may be a frame, if it is inside the time window."""
+        """Record the time stamp of a possible frame, if its log time is in the time window."""
         log_time, (start, end) = int(run.log_time_ns[row]), self._window
         if start <= log_time <= end:
             self.leads[int(run.channel[row])].stamps.see(log_time, stamp_ns)
 
     def count(self, run: Messages, row: int, weight: int) -> None:
-        """Count a message as a frame of its channel, if it is inside the time window."""
+        """Count a message as a frame of its channel, if its log time is in the time window."""
         log_time, (start, end) = int(run.log_time_ns[row]), self._window
         if start <= log_time <= end:
             lead = self.leads[int(run.channel[row])]
@@ -315,7 +315,7 @@ class Survey(Generic[AnyLead]):
         return min(ranked)[-1] if ranked else -1
 
     def alike(self, channel: int) -> list[int]:
-        """Return the ids of all channels with the same topic and schema as the given channel."""
+        """Return the ids of all channels with the topic and schema of the given channel."""
         channels = self.recording.channels
         return [number for number in sorted(channels) if self._key(number) == self._key(channel)]
 
@@ -326,7 +326,7 @@ class Survey(Generic[AnyLead]):
         return record.topic, record.message_encoding, *named
 
     def shared_stamps(self, channel: int, stamps: Stamps) -> Stamps:
-        """Return the time stamps of another channel with equal topic and schema; otherwise the given ones."""
+        """Return the time stamps of a known channel with the same topic and schema; otherwise ``stamps``."""
         leads = self.leads
         return next((leads[one].stamps for one in self.alike(channel) if one in leads), stamps)
 
@@ -336,7 +336,7 @@ class Survey(Generic[AnyLead]):
         return lost[0].reason if lost else "no list of objects can be read"
 
     def ego_named(self, name: str) -> str | None:
-        """Return the id of the ego vehicle for a name. ``None`` means that only a new first pass can find it.
+        """Return the id of the ego with a name; ``None`` if only another reading of the recording finds it.
 
         Raises
         ------
@@ -362,17 +362,17 @@ class Survey(Generic[AnyLead]):
         return "ground_truth" if channel in self.alike(self.leading) else "payload"
 
     def context(self) -> Iterable[Ref]:
-        """Return the file positions of messages that are needed to read later messages."""
+        """Return the file positions of the messages that later messages need."""
         return self.once(self.leads[self.leading].first_ns)
 
     def tell(self, report: TraceReport) -> None:
-        """Add the warnings and lost messages of the first pass to a report."""
+        """Add the warnings and losses of the first reading to a report."""
         report.warnings += [*self.notes, *self.about_ego]
         report.about_ego += self.about_ego
         report.losses += self.lost.losses()
 
     def once(self, first_ns: int) -> list[Ref]:
-        """Return the messages near the first frame that are the only message of their channel.
+        """Return each message that is the only one of its channel, if it is near the first frame.
 
         Such a message, for example a camera calibration, is valid for the whole recording.
         """
@@ -461,7 +461,7 @@ class MessageTrace:
         self.recording.close()
 
     def ego_named(self, name: str) -> str | None:
-        """Return the id of the ego vehicle for a name. ``None`` means that the recording must be opened again.
+        """Return the id of the ego vehicle with a name; ``None`` if the recording must be opened again.
 
         Raises
         ------
@@ -499,7 +499,7 @@ class MessageTrace:
             raise TraceError(f"no frame: {reason}", path=self.info.path, channel=topic)
 
     def _steps_and_noise(self) -> tuple[list[int], Noise]:
-        """Return the time differences between the first frames in ns, and the noise of the positions.
+        """Return the time steps (ns) between the first frames, and the noise of the positions.
 
         The noise is that of the setting, or of the first frames.
         """
@@ -515,11 +515,11 @@ class MessageTrace:
         return steps, first_noise(decoder, [*frames, *islice(raw, ESTIMATED - len(frames))])
 
     def _surveyed_steps(self) -> list[int]:
-        """Return the time differences between the first frames, if the first pass knows them; ns."""
+        """Return the time steps between the first frames, if the first reading has found them; ns."""
         return []
 
     def _raw(self, decoder: MessageDecoder[Any]) -> Iterator[Any]:
-        """Yield the raw frames of the recording in order."""
+        """Yield the frames of the recording in order, before conversion."""
         for run in self.recording.walk(TraceReport(), rank=self._rank):
             for row in np.flatnonzero(np.isin(run.channel, [*decoder.channels])).tolist():
                 frame = decoder.decode(run, row)
@@ -531,7 +531,7 @@ AnySurvey = TypeVar("AnySurvey", bound=Survey[Any])
 
 
 class SurveyedTrace(MessageTrace, Generic[AnySurvey]):
-    """Open recording whose first pass (collection of facts) is complete.
+    """Open recording after its first reading, which collected information for the frames.
 
     Parameters
     ----------
@@ -577,16 +577,16 @@ class SurveyedTrace(MessageTrace, Generic[AnySurvey]):
 
     @classmethod
     def recognises(cls, recording: Recording) -> bool:
-        """Return True if the recording has a channel that this reader can read as frames."""
+        """Return True if this reader can read a channel of the recording as frames."""
         return any(cls.has_frames(recording, channel) for channel in recording.channels)
 
     @staticmethod
     def has_frames(recording: Recording, channel: int) -> bool:
-        """Return True if the schema of a channel shows messages that this reader can read as frames."""
+        """Return True if this reader can read messages with the channel's schema as frames."""
         raise NotImplementedError
 
     def decoder(self, report: TraceReport) -> MessageDecoder[Any]:
-        """Return a new decoder of messages, and add the warnings of the first pass to its report."""
+        """Return a new decoder of messages. Add the warnings of the first reading to its report."""
         self._survey.tell(report)
         return self._decoder(report)
 
@@ -597,12 +597,12 @@ class SurveyedTrace(MessageTrace, Generic[AnySurvey]):
         return self._survey.leads[self._survey.leading].stamps.steps[:FIRST_STEPS]
 
     def ego_named(self, name: str) -> str | None:
-        """Return the id of the ego vehicle for a name, from the results of the first pass."""
+        """Return the id of the ego vehicle with a name, as found by the first reading."""
         return self._survey.ego_named(name)
 
 
 class SurveyedDecoder(MessageDecoder[Raw], Generic[Raw, AnySurvey]):
-    """Decoder of messages into frames, which uses the facts of a first pass over the recording.
+    """Decoder of messages into frames. It uses information from a first reading of the recording.
 
     Parameters
     ----------
@@ -707,7 +707,7 @@ class FramesTrace(MessageTrace):
         )
 
     def ego_named(self, name: str) -> str:
-        """Return the name of the ego unchanged, because such frames contain no other names than ids."""
+        """Return the name of the ego unchanged. Such frames have no names other than ids."""
         return name
 
     @staticmethod
@@ -728,7 +728,7 @@ class FramesTrace(MessageTrace):
         raise NotImplementedError
 
     def frame(self, message: TraceMessage) -> Frame | None:
-        """Convert a message into a frame. ``None`` means that the message is not a frame.
+        """Convert a message into a frame; ``None`` if the message is not a frame.
 
         Parameters
         ----------
@@ -753,12 +753,12 @@ class FramesTrace(MessageTrace):
         """
 
     def map_text(self, message: TraceMessage) -> str:
-        """Return the OpenDRIVE text (road map) in a message of a channel with the role ``map``."""
+        """Return the OpenDRIVE text (road map) in a message. The channel has the role ``map``."""
         return message.data.decode("utf-8")
 
     @classmethod
     def recognises(cls, recording: Recording) -> bool:
-        """Return True if the recording has a channel that this reader can read as frames."""
+        """Return True if this reader can read a channel of the recording as frames."""
         return any(channel.role == "ground_truth" for channel in _channels(cls, recording))
 
     def decoder(self, report: TraceReport) -> _FramesDecoder:
@@ -768,7 +768,7 @@ class FramesTrace(MessageTrace):
         return _FramesDecoder(self, self._channels, self._ego, self.recording.window, report)
 
     def _beginning(self) -> tuple[str, list[Ref], str]:
-        """Return the ego of the first frame, the messages that later messages need, and the road map.
+        """Return the ego of the first frame, the messages that later ones need, and the road map.
 
         The recording is read only as far as necessary.
         """
@@ -799,7 +799,7 @@ class FramesTrace(MessageTrace):
 
 
 class _FramesDecoder(MessageDecoder[FrameRows]):
-    """Decoder for messages that are complete frames. It also checks the frames.
+    """Decoder for messages that are complete frames. It also checks each frame.
 
     Attributes
     ----------
@@ -828,7 +828,7 @@ class _FramesDecoder(MessageDecoder[FrameRows]):
         self._seq = -1
 
     def decode(self, run: Messages, row: int) -> FrameRows | None:
-        """Return the frame of a message. A frame that is unreadable or contradictory is counted as lost."""
+        """Return the frame in a message. Unreadable and contradictory frames count as lost."""
         try:
             frame = self._trace.frame(_message(self._named, run, row))
             if frame is None:
@@ -854,7 +854,7 @@ class _FramesDecoder(MessageDecoder[FrameRows]):
         return self._rows(frame, log_time)
 
     def complete(self, frames: list[FrameRows]) -> list[FrameRows]:
-        """Return the frames unchanged, because each message is a complete frame."""
+        """Return the frames as they are: each message is a complete frame."""
         return frames
 
     def settle(self) -> None:
@@ -867,7 +867,7 @@ class _FramesDecoder(MessageDecoder[FrameRows]):
         self._warn_of_egos(_NO_EGO)
 
     def _check(self, frame: object) -> None:
-        """Raise an error if a frame contradicts earlier frames of the recording.
+        """Raise an error if a frame does not fit earlier frames of the recording.
 
         The state of the decoder does not change.
         """
@@ -930,7 +930,7 @@ def _meaning(entity: Entity) -> TypeMeaning:
 
 
 def _driven(moving: dict[int, Entity]) -> dict[int, tuple[float, ...]]:
-    """Return the control inputs (steering, throttle, brake, …) of objects with a known input, by node id."""
+    """Return the known control inputs (steering, throttle, brake, …) of the objects: node id → values."""
     told = ((node, entity.numbers[len(POSE) :]) for node, entity in moving.items())
     return {node: inputs for node, inputs in told if not np.isnan(inputs).all()}
 

@@ -126,7 +126,7 @@ class FrameRows:
         return len(self.node)
 
     def with_heads(self, heads: tuple[Ints, Floats, Ints]) -> FrameRows:
-        """Return the frame with additional rows of traffic lights: node ids, poses and light states."""
+        """Return the frame with rows of traffic lights added: node ids, poses and light states."""
         node, values, light_state = heads
         if not len(node):
             return self
@@ -251,7 +251,7 @@ class EntityTable:
         return self._rows[number]
 
     def enter_again(self, row: EntityRow, before: int) -> int:
-        """Add a new object that reuses the id of an earlier object, and return its node id.
+        """Add a new object with an id that an earlier object had. Return its node id.
 
         Parameters
         ----------
@@ -263,12 +263,12 @@ class EntityTable:
         return before + len(self._returned) - 1
 
     def turn(self, number: int, lifetime: int, seq: int) -> None:
-        """Record which object (lifetime number) an id refers to from a frame on."""
+        """Record that an id belongs to another object from a frame on, given by its lifetime number."""
         self._turns.setdefault(self._rows[number].ident, []).append((seq, lifetime))
 
     @property
     def returned(self) -> int:
-        """Number of objects that reuse the id of an earlier object."""
+        """Number of objects with an id that an earlier object had."""
         return len(self._returned)
 
     def nodes_of(self, numbers: Ints) -> Ints:
@@ -300,7 +300,7 @@ class EntityTable:
         return tuple(events)
 
     def _lifetime(self, ident: str, seq: int) -> int:
-        """Return the lifetime number (1, 2, …) of the object that uses an id in a frame."""
+        """Return the lifetime number (1, 2, …) of the object that has an id in a given frame."""
         turns = self._turns.get(ident, ())
         at = bisect_right(turns, seq, key=itemgetter(0))
         return turns[at - 1][1] if at else 1
@@ -385,7 +385,7 @@ class LossTally:
         self._found: dict[str, Loss] = {}
 
     def add(self, reason: str, log_time_ns: int, size: int = 0) -> None:
-        """Count a lost message of ``size`` bytes under a reason."""
+        """Count a lost message of ``size`` bytes, with the reason of the loss."""
         if reason not in self._found and len(self._found) >= self.MOST:
             reason = "and more of the same kinds"
         last = self._found.get(reason) or Loss(reason, 0, 0, log_time_ns, log_time_ns)
@@ -403,7 +403,7 @@ class LossTally:
 
 
 class MessageDecoder(Generic[Raw]):
-    """Decoder of messages into frames, in two steps, to convert the values of many frames at once.
+    """Decoder of messages into frames. It works in two steps, so that many frames are converted at once.
 
     Parameters
     ----------
@@ -440,11 +440,11 @@ class MessageDecoder(Generic[Raw]):
         self._untimed = 0
 
     def decode(self, run: Messages, row: int) -> Raw | None:
-        """Return the raw frame of a message. ``None`` means that the message is not a frame."""
+        """Return the frame in a message, before conversion; ``None`` if the message is not a frame."""
         raise NotImplementedError
 
     def complete(self, frames: list[Raw]) -> list[FrameRows]:
-        """Convert raw frames to frames with all numbers (poses, speeds, sizes).
+        """Convert frames: compute all numbers (poses, speeds, sizes) of many frames at once.
 
         It is called for a frame only after the next frame or the end of the recording, because other messages
         about the same instant may follow the leading message.
@@ -463,7 +463,7 @@ class MessageDecoder(Generic[Raw]):
             self._report.warnings.append(words)
 
     def is_inside(self, log_time_ns: int) -> bool:
-        """Return True if a message with this log time can be a frame. Clips also contain earlier messages."""
+        """Return True if a message with this log time can be a frame. Clips also have earlier messages."""
         return self._window[0] <= log_time_ns <= self._window[1]
 
     def lose(self, reason: str, run: Messages, row: int) -> None:
@@ -471,7 +471,7 @@ class MessageDecoder(Generic[Raw]):
         self._unreadable.add(reason, int(run.log_time_ns[row]), int(run.length[row]))
 
     def _warn_of_egos(self, words: str) -> None:
-        """Add a warning about a missing ego to the report. It is removed if the user names the egos."""
+        """Add a warning about a missing ego to the report. It is removed later if the user names egos."""
         self._report.warnings.append(words)
         self._report.about_ego.append(words)
 
@@ -544,7 +544,7 @@ def assemble(
 
 
 class _BlockMaker(Generic[Raw]):
-    """Builder of blocks. It holds frames back until the later frames that they depend on are complete.
+    """Builder of blocks. It keeps frames until all later frames are known that they depend on.
 
     Parameters
     ----------
@@ -578,16 +578,16 @@ class _BlockMaker(Generic[Raw]):
 
     @property
     def starts_block(self) -> bool:
-        """True if the next frame is the first of another block."""
+        """True if the next frame begins another block."""
         return self._count > 0 and self._count % self._size == 0
 
     def start_block(self, before: list[MessageRefs], same: list[MessageRefs], known: int) -> None:
-        """End the current block before the next frame. ``known``: number of entities before that frame."""
+        """End the current block before the next frame. ``known``: number of entities until then."""
         self._borders.append((self._refs + before, known))
         self._refs = same
 
     def add(self, frame: Raw, refs: list[MessageRefs]) -> None:
-        """Add a frame and the positions of the messages before it."""
+        """Add a frame, and the positions of the messages between the frame before and this frame."""
         self._raw.append(frame)
         self._refs += refs
         self._count += 1
@@ -598,7 +598,7 @@ class _BlockMaker(Generic[Raw]):
         return self._count - self._first
 
     def ready(self, known: int) -> Iterator[FrameBlock]:
-        """Yield the next block as soon as all frames that it depends on are complete.
+        """Yield the next block as soon as the later frames are known that it depends on.
 
         ``known``: number of entities of the frames so far.
         """
@@ -609,7 +609,7 @@ class _BlockMaker(Generic[Raw]):
             yield self.block(self._size)
 
     def finish(self, refs: list[MessageRefs]) -> None:
-        """End the last block. ``refs`` are the messages after the last frame."""
+        """End the last block. ``refs``: positions of messages after the last frame."""
         self._sizes.append(self._decoder.roster.size)
         self._complete()
         self._borders.append((self._refs + refs, self._decoder.roster.size))
@@ -640,7 +640,7 @@ class _BlockMaker(Generic[Raw]):
 
 @dataclass(slots=True)
 class _Between:
-    """Buffer for the positions of messages between two frames. If it is full, it keeps the first and last ones.
+    """Buffer for positions of messages between two frames. A full buffer keeps the first and last ones.
 
     A recording may contain hours of pictures without ground truth. Messages far from every frame are not
     needed.
@@ -661,7 +661,7 @@ class _Between:
             self._total = 2 * NEAR_REFS
 
     def split(self, log_time_ns: int) -> tuple[list[MessageRefs], list[MessageRefs]]:
-        """Empty the buffer. Return message positions of other log times, and those of the given log time."""
+        """Empty the buffer. Return message positions with other log times, and those with the given one."""
         if not self._total:
             return self.take(), []
         whole = chained(self.take())
@@ -669,13 +669,13 @@ class _Between:
         return [taken(whole, np.flatnonzero(~same))], [taken(whole, np.flatnonzero(same))]
 
     def take(self) -> list[MessageRefs]:
-        """Empty the buffer, and return its message positions in order."""
+        """Empty the buffer. Return the message positions in order."""
         parts, self._parts, self._total = self._parts, [], 0
         return parts
 
 
 def counted(blocks: Iterable[FrameBlock], report: TraceReport) -> Iterator[FrameBlock]:
-    """Yield blocks of frames unchanged, and count their frames, states and clock faults in the report."""
+    """Yield blocks of frames unchanged. Count frames, states and clock faults in the report."""
     last: int | None = None
     back, still = 0, 0
     for block in blocks:
@@ -702,7 +702,7 @@ def _block(
     known: int,
     smoother: Smoother | OnlineSmoother | None,
 ) -> FrameBlock:
-    """Return a block of frames, built from these frames and the frames next to them.
+    """Build a block of frames from its frames and the frames before and after it.
 
     ``part``: number of frames before the block, and of frames in it; ``known``: number of entities before
     the first frame of the next block.
@@ -750,7 +750,7 @@ def _block(
 
 
 def _columns(window: list[FrameRows], seconds: Floats) -> tuple[Ints, Ints, Floats, Floats, Bools]:
-    """Return nodes, frames, time steps, values, and a mask of fixed objects, as arguments of :func:`derive`."""
+    """Return the arguments of :func:`derive`: nodes, frames, time steps, values, fixed objects."""
     return (
         np.concatenate([frame.node for frame in window]),
         np.repeat(np.arange(len(window)), [len(frame) for frame in window]),
@@ -787,7 +787,7 @@ FIRST_STEPS: Final = 64
 
 
 class LifetimeTracker:
-    """Assignment of node ids to objects. An id that returns as another object gets a new node id.
+    """Assignment of node ids to objects. If an id returns with another object, the object gets a new node id.
 
     Node ids depend on lifetimes, by the rule of :class:`~sgstore.model.world.Lives`. Most ids have the same
     entity in all frames. They are compared as arrays; only the rows of possibly different entities are
@@ -823,7 +823,7 @@ class LifetimeTracker:
         self._warnings: list[str] = []
 
     def follow(self, frames: list[FrameRows], sizes: list[int]) -> list[FrameRows]:
-        """Return the next frames with final node ids, also for ids reused by other objects.
+        """Return the next frames with final node ids. Objects that share an id get different node ids.
 
         ``sizes`` is the number of known ids at each frame.
         """
@@ -855,7 +855,7 @@ class LifetimeTracker:
             )
 
     def _seconds(self, time_ns: int) -> float:
-        """Return the time since the last frame; s. NaN means a gap or a backward step of the clock."""
+        """Return the time since the frame before; s. NaN if there is a gap, or the clock went back."""
         last, self._time = self._time, time_ns
         step = 0 if last is None else time_ns - last
         if step < 0:
@@ -871,7 +871,7 @@ class LifetimeTracker:
         return step / 1e9 if joined else NAN
 
     def _earlier(self, frames: list[FrameRows], runs: list[int]) -> list[dict[int, Sight | None]]:
-        """Return the rows whose id may now belong to another object, with its last position, for each frame.
+        """For each frame, return the rows whose id may belong to a new object, with the last known position.
 
         These are ids with a jump, and ids with a different kind in some frame.
         """
@@ -921,7 +921,7 @@ class LifetimeTracker:
     def _entered(
         self, frame: FrameRows, run: int, earlier: dict[int, Sight | None], size: int
     ) -> FrameRows:
-        """Return a frame with the node ids of its objects. Objects with a reused id are added."""
+        """Return a frame with the node ids of its objects. Add objects with a reused id to the object table."""
         numbers, nodes = frame.node.tolist(), self._roster.nodes_of(frame.node).tolist()
         for row, number in enumerate(numbers):
             if row not in earlier and number not in self._lives:
@@ -946,7 +946,7 @@ class LifetimeTracker:
         )
 
     def _follow(self, number: int, kind: int, here: Sight, called: Called | None, size: int) -> int:
-        """Return the node id of the object that uses an id in a frame."""
+        """Return the node id of the object that has an id in a given frame."""
         lives = self._lives[number]
         before = lives.last
 
@@ -961,7 +961,7 @@ class LifetimeTracker:
         return node
 
     def _enter(self, number: int, called: Called | None, size: int, why: str) -> tuple[int, int]:
-        """Add a new object that reuses an id, and return its node id and lifetime number."""
+        """Add a new object with a reused id. Return its node id and lifetime number."""
         row = self._roster.entered(number)
         if called is not None:
             meaning, type_name = called
@@ -980,7 +980,7 @@ class LifetimeTracker:
 
 
 def _on_earth(frames: list[FrameRows], roster: EntityTable) -> list[FrameRows]:
-    """Replace impossible values (too large numbers) in frames by NaN, and count them."""
+    """In some frames, replace impossible values (too large numbers) by NaN, and count them."""
     values = np.concatenate([frame.values for frame in frames] or [np.zeros((0, len(POSE)))])
     absurd = np.abs(values) >= FAR
     if absurd.any():
@@ -1016,7 +1016,7 @@ def _controls(nodes: Ints, ego: Ints, frames: list[FrameRows], counts: Ints) -> 
 
 
 def _own(frames: list[FrameRows]) -> NDArray[np.object_]:
-    """Return the attributes without a column: for each row of the frames, a mapping or ``None``."""
+    """Return the attributes that have no column: a mapping or ``None`` for each row of the frames."""
     column = np.full(sum(map(len, frames)), None, object)
     start = 0
     for frame in frames:
@@ -1092,7 +1092,7 @@ def derive(
 
 
 def _neighbours(node: Ints, frame: Ints, seconds: Floats, rows: slice) -> Steps:
-    """Return the rows of the same node in the previous and next frame, and the time steps; s. NaN: none."""
+    """Return the same node's rows in the frames before and after, and the time steps; s. NaN without a row."""
     span = int(node.max()) + 1
     keys = frame * span + node
     order = np.argsort(keys)
@@ -1110,7 +1110,7 @@ def _neighbours(node: Ints, frame: Ints, seconds: Floats, rows: slice) -> Steps:
 
 
 def _possible(values: Floats, rows: slice, steps: Steps) -> tuple[Steps, Bools]:
-    """Return the time steps without those of impossible speed, and a mask of the changed rows."""
+    """Return the time steps, NaN for impossible speeds, and a mask of the rows with such steps."""
     before, behind, since, until = steps
     position = values[:, _X : _X + 3]
     lost = np.zeros(len(since), np.bool_)
@@ -1124,7 +1124,7 @@ def _possible(values: Floats, rows: slice, steps: Steps) -> tuple[Steps, Bools]:
 
 
 def _slope(values: Floats, rows: slice, steps: Steps, turn: float = 0.0) -> Floats:
-    """Return the rate of change of values at each row, from the previous and next frame if available.
+    """Return how fast values change at each row, from the rows before and after it, as far as available.
 
     ``turn``: period of the values, for example 2π; differences are then the smallest possible.
     """
@@ -1141,7 +1141,7 @@ def _slope(values: Floats, rows: slice, steps: Steps, turn: float = 0.0) -> Floa
 
 
 def _accelerations(values: Floats, rows: slice, steps: Steps, moving: Steps) -> Floats:
-    """Return accelerations from velocities, only over time steps with plausible speeds.
+    """Compute accelerations from velocities. Use only time steps with plausible speeds.
 
     ``moving`` contains these time steps.
     """

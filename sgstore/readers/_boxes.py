@@ -1,4 +1,4 @@
-"""Logs of annotated boxes: poses as quaternions, frames as JSON messages, and the base class of their readers.
+"""Logs of annotated boxes: quaternions, JSON messages of frames, and the base class of the readers.
 
 A message has a time, the id of the ego, and boxes with the arguments of :meth:`sgstore.Frame.add`.
 """
@@ -59,7 +59,7 @@ class Boxes:
     motion: Floats | None = None
 
     def message(self, time_ns: int, ego: str, rows: list[int], **more: Any) -> bytes:
-        """Return one frame as JSON text, made of some rows. Unknown numbers are left out."""
+        """Return the boxes in some rows as one frame, as JSON text. Unknown numbers are left out."""
         values = np.hstack(
             [self.centre[rows], np.degrees(angles_of(self.turn[rows])), self.size[rows]]
         )
@@ -111,7 +111,7 @@ def angles_of(turn: Floats) -> Floats:
 
 
 def interpolated(times: Any, poses: Floats, at: Any, furthest: float) -> Floats:
-    """Interpolate poses (n, 7: place and quaternion) at some times.
+    """Interpolate poses (n, 7: position and quaternion) at given times.
 
     The result is NaN outside the times, and between poses more than ``furthest`` apart.
     """
@@ -132,14 +132,14 @@ def interpolated(times: Any, poses: Floats, at: Any, furthest: float) -> Floats:
 
 
 def steps_of(times: Any) -> list[Any]:
-    """Return the rows of each time in ascending order. A time below 0 counts as damage."""
+    """Return the rows of each time, in ascending order of times. Rows with a time below 0 are left out."""
     order = np.argsort(times, kind="stable")
     order = order[times[order] >= 0]
     return np.split(order, np.flatnonzero(np.diff(times[order])) + 1) if len(order) else []
 
 
 class BoxesTrace(FramesTrace):
-    """Base class for readers of logs with annotated boxes. The channel metadata contain the name of the log.
+    """Base class of readers for logs with annotated boxes. Channel metadata contain the name of the log.
 
     Attributes
     ----------
@@ -157,7 +157,7 @@ class BoxesTrace(FramesTrace):
             self.info = replace(self.info, map_name=f"{name}{OF_LANES}")
 
     def decoder(self, report: Any) -> Any:
-        """Return a new decoder of frames, and add the remark of the log to a report."""
+        """Return a new decoder of frames. Add the note of the log to a report."""
         note = next((c.metadata.get(NOTE, "") for c in self.recording.channels.values()), "")
         report.warnings += [note] if note else []
         return super().decoder(report)

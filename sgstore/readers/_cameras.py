@@ -35,12 +35,12 @@ class Cameras(Protocol):
     topics: tuple[str, ...]
 
     def at(self, seq: int, topic: str) -> Media | None:
-        """Return a camera's picture at a frame. ``None`` means missing or no longer stored."""
+        """Return the picture of a camera at a frame; ``None`` if it is missing or no longer stored."""
         ...
 
 
 class RecordedCameras:
-    """Camera pictures of a recording, for the frames that were read last.
+    """Camera pictures of a recording, for the most recently read frames.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class RecordedCameras:
         self._known: tuple[int, Ints, Ints] = 0, np.zeros(0, np.int64), np.zeros((5, 0), np.int64)
 
     def followed(self, blocks: Iterable[FrameBlock]) -> Iterator[FrameBlock]:
-        """Yield blocks of frames unchanged, and remember the file positions of the camera pictures."""
+        """Yield blocks of frames unchanged. Remember the file positions of camera pictures."""
         mine = [row for row, _ in self._rows.values()]
         for block in blocks:
             _, times, places = self._known
@@ -76,7 +76,7 @@ class RecordedCameras:
             yield block
 
     def at(self, seq: int, topic: str) -> Media | None:
-        """Return a camera's picture nearest to a frame in log time, as at ingest with default settings.
+        """Return the picture of a camera whose log time is nearest to that of a frame, as a store would.
 
         Raises
         ------
@@ -125,7 +125,7 @@ class LiveCameras:
             self._bytes -= self._pictures.popleft()[2].nbytes
 
     def at(self, seq: int, topic: str) -> Media | None:
-        """Return the latest picture of a camera at or before a frame. ``None`` means missing."""
+        """Return the latest picture of a camera at or before a frame; ``None`` if it has none."""
         time_ns = next((time for number, time in tuple(self._times) if number == seq), None)
         if time_ns is None:
             return None

@@ -1,4 +1,4 @@
-"""Base class for files in other formats. They offer the interface of an MCAP file (log of messages)."""
+"""Base class for files in formats other than MCAP. They can be read like an MCAP file (log of messages)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def first_bytes(
     size: int,
     opened: Callable[[Path], BufferedIOBase] = open_regular,
 ) -> bytes:
-    """Return the first bytes of a file; none if it has another suffix, or is unreadable."""
+    """Return the first bytes of a file; empty if it is unreadable or has another suffix."""
     if not path.name.lower().endswith(endings):
         return b""
     try:
@@ -43,7 +43,7 @@ def first_bytes(
 
 
 class MessageFile:
-    """File of another format, with the interface of an MCAP file: only channels and messages.
+    """File of another format that can be read like an MCAP file. It has only channels and messages.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ class MessageFile:
         raise NotImplementedError
 
     def settle_order(self, rank: Callable[[int], int]) -> None:
-        """Do nothing: the order of messages in such a file is fixed."""
+        """Do nothing: messages in such a file have a fixed order."""
         del rank
 
     def pieces(self, place: RecordPlace) -> Iterator[memoryview]:
@@ -130,7 +130,7 @@ class MessageFile:
 
 
 class NumberedFile(MessageFile):
-    """File whose messages are made on request, by number: 0 is the road map, other numbers are time steps.
+    """File that makes its messages on request. Message 0 is the road map, the others are time steps.
 
     A subclass calls :meth:`add_channels`, and defines :meth:`message` and :meth:`time_of`.
 
@@ -170,15 +170,15 @@ class NumberedFile(MessageFile):
             self.counts[number] = steps if number == 2 else 1
 
     def message(self, number: int) -> bytes:
-        """Return the bytes of a message by number. An unknown number is an ``IndexError``."""
+        """Return the bytes of the message with a number. An unknown number raises an ``IndexError``."""
         raise NotImplementedError
 
     def time_of(self, number: int) -> int:
-        """Return the time of a step by number, from 1; ns."""
+        """Return the time of the step with a number, from 1; ns."""
         raise NotImplementedError
 
     def _walk(self, report: Findings, wanted: Callable[[int], bool]) -> Iterator[Messages]:
-        """Yield the map, then the steps. The ``offset`` of a message is its number."""
+        """Yield the map, then the steps. ``offset`` of a message is its number."""
         for reason in self.losses:
             report.lose(Loss(reason, bytes=0))
         if not wanted(-1):
@@ -199,7 +199,7 @@ class NumberedFile(MessageFile):
 def read_numbered(
     opened: Callable[[Path], Any], path: Path, places: Iterable[tuple[int, int, int]]
 ) -> Iterator[bytes]:
-    """Yield the bytes of the messages that places refer to by number and length.
+    """Yield the bytes of messages, given by their number and length.
 
     ``opened``: class of the file, with a method ``message``.
 
@@ -223,7 +223,7 @@ def read_numbered(
 def grouped(
     messages: Iterable[tuple[int, int, bytes]],
 ) -> Iterator[tuple[dict[int, bytes], list[int]]]:
-    """Yield messages (offset, time, bytes) in groups: bytes by offset, and times."""
+    """Yield messages (offset, time, bytes) in groups: mapping offset → bytes, and list of times."""
     held: dict[int, bytes] = {}
     times: list[int] = []
     size = 0
@@ -239,7 +239,7 @@ def grouped(
 
 
 def numbered_runs(messages: Iterable[tuple[int, int, bytes]], channel: int) -> Iterator[Messages]:
-    """Yield the messages (offset, time, bytes) of one channel in groups. Their sequence is their number."""
+    """Yield messages (offset, time, bytes) of one channel in groups. ``sequence`` numbers them from 0."""
     first = 0
     for held, times in grouped(messages):
         sequence = range(first, first + len(held))
@@ -255,7 +255,7 @@ def held_messages(
     sequence: int | range | list[int] = 0,
     chunk_offset: int = -1,
 ) -> Messages:
-    """Return a group of messages in memory as columns.
+    """Return messages in memory as one group of columns.
 
     Parameters
     ----------

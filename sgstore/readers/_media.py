@@ -72,7 +72,7 @@ _PICTURES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class _Codec:
-    """Video codec (such as H.264), with the meaning of its NAL unit types."""
+    """Video codec (such as H.264) and the meaning of its NAL unit types."""
 
     name: str
     named: re.Pattern[str]
@@ -99,7 +99,7 @@ _UNIT: Final = re.compile(rb"\x00\x00\x01(.)", re.DOTALL)
 
 @dataclass(frozen=True, slots=True)
 class Media:
-    """Picture, video frame or raw bytes of a sensor message, with the format.
+    """Picture, video frame or raw bytes of a sensor message, and the format.
 
     Attributes
     ----------
@@ -200,7 +200,7 @@ def _of_json(message: bytes) -> Mapping[str, Any] | None:
 
 
 def _unwrapping(recording: Recording, channel: int) -> Callable[[bytes], tuple[bytes, str]]:
-    """Return a function that extracts picture data and format from a message; empty without a picture."""
+    """Return a function that returns picture data and format of a message; empty without a picture."""
     if channel not in recording.channels:
         # Without a summary, channels are known only after a walk.
         for _ in recording.walk(Findings()):
@@ -323,7 +323,7 @@ def png(pixels: NDArray[Any]) -> bytes:
 def _decodable(
     codec: _Codec, last: bytes, before: Iterator[tuple[bytes, str]]
 ) -> tuple[list[bytes], list[bytes]]:
-    """Return the video frames from the last key frame on, and the codec parameters needed before them.
+    """Return the video frames since the last key frame, with the codec parameters that a decoder needs.
 
     Parameters
     ----------
@@ -361,7 +361,7 @@ def _is_key(codec: _Codec, data: bytes) -> bool:
 
 
 def _parameters(codec: _Codec, data: bytes) -> dict[int, bytes]:
-    """Return the codec parameter sets in a video frame: type → bytes with the start code."""
+    """Return the codec parameters in a video frame: NAL unit type → bytes with start code."""
     units = list(_UNIT.finditer(data))
     ends = [unit.start() for unit in units[1:]] + [len(data)]
     found: dict[int, bytes] = {}
@@ -380,7 +380,7 @@ _Row = tuple[int, int, int, "Callable[[], bytes]"]
 
 
 def _rows(path: Path, base: int, channel: int, chunk: int) -> list[_Row]:
-    """Return the video messages in a chunk of a file, or outside all chunks (-1), with time and position.
+    """Return time and position of the video messages in a chunk, or outside chunks for -1.
 
     ``base`` is the position of the file in its bag.
     """
@@ -397,7 +397,7 @@ def _rows(path: Path, base: int, channel: int, chunk: int) -> list[_Row]:
 
 
 def _before(path: Path, channel: int, chunk_offset: int, offset: int) -> Iterator[bytes]:
-    """Yield the messages of a video channel before a given message, latest first."""
+    """Yield the messages of a video channel that come before a given message, the latest first."""
     chunked = chunk_offset >= 0
     at = chunk_offset if chunked else offset
     parts = [*_parts(path, channel)]
@@ -431,7 +431,7 @@ def _copied(messages: Messages, row: int) -> bytes:
 
 
 def _parts(path: Path, channel: int) -> Iterator[tuple[Path, int, int]]:
-    """Yield each file of a recording with its byte position and the channel's id in this file."""
+    """Yield each file of a recording, its byte position, and the channel's id in it."""
     folder = bag_folder(path)
     if folder is None:
         yield path, 0, channel
@@ -446,7 +446,7 @@ def _parts(path: Path, channel: int) -> Iterator[tuple[Path, int, int]]:
 
 
 def _chunks(path: Path) -> list[tuple[int, int, int]]:
-    """Return byte offset, first and last log time of each chunk in an MCAP file."""
+    """Return byte offset, first log time and last log time of each chunk in an MCAP file."""
     with open_regular(path) as file:
         offsets: list[int] = read_summary(file, file.seek(0, 2)).chunk_offsets.tolist()
     if not offsets:

@@ -77,7 +77,7 @@ class RecordingReader(Protocol):
         ...
 
     def recognises(self, recording: Recording) -> bool:
-        """Return True if the reader can read a recording, according to the schemas of its channels."""
+        """Return True if the reader can read a recording. The schemas of its channels decide this."""
         ...
 
 
@@ -88,7 +88,7 @@ READERS: Final[tuple[RecordingReader, ...]] = tuple(
 
 
 def readers() -> Iterator[RecordingReader]:
-    """Yield all readers: first those of sgstore, then those of other packages.
+    """Yield all readers: those of sgstore first, then those of other packages.
 
     Raises
     ------
@@ -174,7 +174,7 @@ def open_trace(
 
 
 def on_map(trace: MessageTrace, road_map: RoadMap | None) -> None:
-    """Pass the road map to an open recording, if its reader needs the map.
+    """If the reader of an open recording needs the road map, pass it on.
 
     Such a flavour has a method ``on_map``, which is called before the frames are read.
     """
@@ -186,7 +186,7 @@ def on_map(trace: MessageTrace, road_map: RoadMap | None) -> None:
 def _format_of(
     path: Path,
 ) -> tuple[Callable[[Path], RecordingFile], Callable[..., Iterator[bytes | memoryview]]]:
-    """Return the functions that open a file of this format, and that read single messages of it."""
+    """Return two functions for the format of a file: open it, and read single messages of it."""
     if (files := log_files(path)) is not None:
         return _numbered(_FOLDERS.get(files[0].name, Av2File))
     if is_scenario(path):
@@ -205,7 +205,7 @@ _FOLDERS: Final[dict[str, Any]] = {METADATA: RosbagFile, "sync.arrow": Py123dFil
 
 
 def _numbered(opened: Any) -> tuple[Any, Any]:
-    """Return the class of a file whose messages have numbers, and the function that reads single messages."""
+    """Return two functions for a file with numbered messages: open it, and read single messages."""
     return opened, partial(read_numbered, opened)
 
 

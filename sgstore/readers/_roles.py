@@ -1,4 +1,4 @@
-"""Reading order of messages with equal times, given by the rank of their channels.
+"""Order of reading messages with equal times. Each channel has a rank.
 
 A frame needs the map, static entities, transforms and signals of its instant first. Messages that refer to a
 frame, such as the controls of the ego, come after it.
@@ -73,7 +73,7 @@ _ROLES: Final = {"map": MAP, "ground_truth": STATES}
 def channel_rank(
     recording: Recording, roles: Mapping[int, str] | None = None
 ) -> Callable[[int], int]:
-    """Return a function: channel id → rank. Of messages with equal times, the lowest rank is read first.
+    """Return a function from channel id to rank. Among messages with equal times, the lowest rank is first.
 
     ``roles``: role by channel id, for channels whose schema has no rank.
     """

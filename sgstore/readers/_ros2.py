@@ -176,7 +176,7 @@ def parse_definition(name: str, text: bytes) -> Struct:
 
 
 def short_name(name: str) -> str:
-    """Shorten a ROS type name: ``package/Type`` for ``package/msg/Type``."""
+    """Return the short form of a ROS type name: ``package/Type`` for ``package/msg/Type``."""
     package, _, rest = name.partition("/")
     return f"{package}/{rest.removeprefix('msg/')}" if rest else name
 
@@ -196,7 +196,7 @@ def ros_name(recording: Recording, channel: int) -> str:
 
 
 def _texts(name: str, text: str) -> dict[str, list[str]]:
-    """Split a ROS message definition: type name → lines. Only the first definition of a name counts."""
+    """Split a ROS message definition: type name → lines. If a name is defined twice, the first one counts."""
     texts: dict[str, list[str]] = {name: []}
     lines = texts[name]
     separated = False
@@ -260,7 +260,7 @@ class _Parser:
         return struct
 
     def _fields(self, owner: str, line: str) -> tuple[tuple[str, Type], ...]:
-        """Parse one line of a ROS definition into a field; empty for a constant. Default values are ignored."""
+        """Parse a line of a ROS definition into a field; empty for a constant. Default values are ignored."""
         found = _LINE.fullmatch(line)
         if found is None:
             raise TraceError(f"{owner}: a line that defines no field: {line[:80]!r}")
@@ -292,7 +292,7 @@ def _array(owner: str, found: re.Match[str], element: Type) -> Sequence:
 
 
 def least(kind: Type) -> int:
-    """Return the minimum size of a value of a ROS type, without padding; bytes."""
+    """Return the smallest possible size of a value of a ROS type, without padding; bytes."""
     match kind:
         case Number(size=size) | Struct(least=size):
             return size
@@ -303,7 +303,7 @@ def least(kind: Type) -> int:
 
 
 def members(kind: Type) -> int:
-    """Return the number of values in a ROS type, with nested structures. A sequence counts as one."""
+    """Return how many values a ROS type has, including nested structures. A sequence counts as one value."""
     return kind.members if isinstance(kind, Struct) else 1
 
 
@@ -390,7 +390,7 @@ def records(record: dict[str, Any], path: str) -> list[dict[str, Any]]:
 
 
 def ident_of(record: dict[str, Any], path: str) -> int | None:
-    """Return the id number at a field path of a decoded message. ``None`` means missing or too large."""
+    """Return the id at a field path of a decoded message; ``None`` if it is missing or too large."""
     value = number(record, path)
     return int(value) if abs(value) < MAX_IDENT else None
 
@@ -410,7 +410,7 @@ def _unpacker(code: str) -> Callable[..., tuple[Any, ...]]:
 
 @dataclass(slots=True)
 class MessageReader:
-    """Read position in the bytes of a ROS message.
+    """Current read position in the bytes of a ROS message.
 
     ``values``: bytes after the head; ``order``: byte order of numbers; ``place``: position of the next byte;
     ``left``: number of further values allowed.
@@ -434,7 +434,7 @@ class MessageReader:
         return cls(memoryview(data)[HEAD:], _ORDERS[kind])
 
     def take(self, size: int, align: int) -> int:
-        """Skip padding and ``size`` bytes of a message, and return the start of these bytes."""
+        """Skip padding and the next ``size`` bytes of a message. Return where these bytes start."""
         start = self.place + -self.place % align
         if start + size > len(self.values):
             raise TraceError(
@@ -461,7 +461,7 @@ class MessageReader:
         return count
 
     def prefix(self, start: int) -> tuple[int, int]:
-        """Return the position and the value of a length field that was read before."""
+        """Return position and value of a length field that has already been read."""
         place = start + -start % LENGTH
         return place, _unpacker(self.order + "I")(self.values, place)[0]
 
@@ -506,20 +506,20 @@ class MessageReader:
         return [self.value(element) for _ in range(count)]
 
     def spend(self, values: int) -> None:
-        """Count decoded values of a message. Raise an error above the limit."""
+        """Count values of a message that are decoded. Raise an error if there are too many."""
         self.left -= values
         if self.left < 0:
             raise TraceError(f"a message of more than {MAX_VALUES} values")
 
 
 def dtype_of(order: str, code: str) -> np.dtype[Any]:
-    """Return the type of numbers in a message. Booleans are bytes there."""
+    """Return the numpy type of numbers in a message. Booleans are read as bytes."""
     return np.dtype(order + code.replace("?", "B"))
 
 
 @dataclass(slots=True)
 class _StructLayout:
-    """Byte positions of the numbers within one element of a ROS sequence.
+    """Byte positions of the numbers in one element of a ROS sequence.
 
     ``size``: bytes from its start to the next element; ``prefixes``: position and value of each length in it;
     ``runs``: first column, position, number and type of adjacent numbers.
@@ -530,7 +530,7 @@ class _StructLayout:
     runs: list[tuple[int, int, int, np.dtype[Any]]]
 
     def agreeing(self, values: memoryview, order: str, place: int, most: int) -> int:
-        """Return how many consecutive elements of the sequence have this layout of numbers."""
+        """Return how many of the next elements of the sequence have their numbers at these positions."""
         for offset, expected in self.prefixes:
             if most < 1:
                 break
@@ -541,7 +541,7 @@ class _StructLayout:
         return most
 
     def copy(self, values: memoryview, place: int, to: Floats) -> None:
-        """Copy the numbers of consecutive sequence elements into an array, one element per row."""
+        """Copy the numbers of the next sequence elements into an array, with one row per element."""
         for column, offset, count, dtype in self.runs:
             numbers: Any = np.ndarray(
                 (len(to), count), dtype, values, place + offset, (self.size, dtype.itemsize)
@@ -550,7 +550,7 @@ class _StructLayout:
 
 
 class ColumnReader:
-    """Fast reader of selected numbers in ROS messages of one type, as columns. Other fields are skipped.
+    """Fast reader of chosen numbers in ROS messages of one type. It returns columns and skips other fields.
 
     Parameters
     ----------
@@ -584,7 +584,7 @@ class ColumnReader:
         self._layouts: dict[tuple[str, int], list[_StructLayout]] = {}
 
     def head(self, data: Data) -> dict[str, Any]:
-        """Return the fields of a ROS message that precede its sequence of elements.
+        """Return the fields of a ROS message that come before its sequence of elements.
 
         Raises
         ------
@@ -595,7 +595,7 @@ class ColumnReader:
         return {name: reader.value(kind) for name, kind in self._head}
 
     def read(self, data: Data) -> tuple[dict[str, Any], Floats]:
-        """Return the leading fields of a ROS message, and selected numbers of its elements (n, columns).
+        """Return the fields before the sequence of a ROS message, and chosen numbers of its elements.
 
         Returns
         -------
@@ -621,7 +621,7 @@ class ColumnReader:
         return head, numbers
 
     def _some(self, reader: MessageReader, to: Floats) -> int:
-        """Read the next element and all following elements with the same layout. Return their number."""
+        """Read the next element and those after it that have the same layout. Return how many were read."""
         values, order, place = reader.values, reader.order, reader.place
         layouts = self._layouts.setdefault((order, place % self._align), [])
         for layout in layouts:
@@ -643,14 +643,14 @@ class ColumnReader:
 
 
 def _learned(reader: MessageReader, kind: Struct, columns: dict[str, int]) -> _StructLayout:
-    """Decode the next sequence element, and return the byte positions of its numbers."""
+    """Decode the next element of a sequence. Return the byte positions of its numbers."""
     walk = _ElementWalk(reader, columns, reader.place)
     walk.step(kind, "")
     return _StructLayout(reader.place - walk.start, walk.prefixes, _side_by_side(walk.found))
 
 
 class _ElementWalk:
-    """Decoder of one sequence element that records the byte positions of its numbers."""
+    """Decoder of one element of a sequence. It records the byte positions of the numbers."""
 
     def __init__(self, reader: MessageReader, columns: dict[str, int], start: int) -> None:
         self.start = start
@@ -660,7 +660,7 @@ class _ElementWalk:
         self._columns = columns
 
     def step(self, kind: Type, path: str) -> None:
-        """Decode a value, and record the byte positions of its numbers."""
+        """Decode a value. Record the byte positions of its numbers."""
         reader = self._reader
         match kind:
             case Number(_, size):
@@ -704,7 +704,7 @@ class _ElementWalk:
 def _side_by_side(
     found: dict[int, tuple[int, np.dtype[Any]]],
 ) -> list[tuple[int, int, int, np.dtype[Any]]]:
-    """Group the numbers that are adjacent in the output columns and also in the message."""
+    """Group numbers that are adjacent both in the message and in the output columns."""
     runs: list[tuple[int, int, int, np.dtype[Any]]] = []
     for column, (place, dtype) in sorted(found.items()):
         if runs:

@@ -38,7 +38,7 @@ Known = tuple[int, int]
 
 @dataclass(slots=True)
 class _Unstamped:
-    """Consecutive messages without a time stamp, and the nearest messages with a stamp on both sides."""
+    """Messages in a row without time stamp, and the nearest messages with a stamp before and after them."""
 
     first: int
     last: int
@@ -48,7 +48,7 @@ class _Unstamped:
 
 @dataclass(slots=True)
 class Stamps:
-    """Time stamps in the messages of a channel, collected by the first pass over the recording.
+    """Time stamps in the messages of a channel, collected in the first reading of the recording.
 
     Attributes
     ----------
@@ -78,11 +78,11 @@ class Stamps:
     _more: bool = False
 
     def next(self) -> None:
-        """Count a message of the channel. Every message must be counted, also without a time stamp."""
+        """Count a message of the channel. Call it for each message, even without a time stamp."""
         self._number += 1
 
     def see(self, log_time_ns: int, stamp_ns: int | None) -> None:
-        """Record the time stamp of the message counted last."""
+        """Record the time stamp of the message that was counted last."""
         if stamp_ns is not None and abs(stamp_ns) >= LATEST_NS:
             count, first = self.late or (0, stamp_ns)
             self.late, stamp_ns = (count + 1, first), None
@@ -110,17 +110,17 @@ class Stamps:
 
     @property
     def clock(self) -> Known | None:
-        """Log time and time stamp of one message. ``None`` means that frames use the log time."""
+        """Log time and time stamp of one message; ``None`` if frames use the log time instead."""
         alone = self._number == 0
         return self.first or (self._zero if self.explicit or alone else None)
 
     def reading(self) -> StampReader:
-        """Return a reader of the message times, for the second pass over the recording."""
+        """Return an object that returns the time of each message in the second reading of the recording."""
         return StampReader(self, self._runs)
 
 
 class StampReader:
-    """Reader of the simulation time of each message of a channel, one message after another.
+    """Simulation times of the messages of a channel, one after another.
 
     Parameters
     ----------
@@ -141,11 +141,11 @@ class StampReader:
         self._offset = 0 if self._clock is None else self._clock[0] - self._clock[1]
 
     def next(self) -> None:
-        """Count a message of the channel. Every message must be counted, also without a time stamp."""
+        """Count a message of the channel. Call it for each message, even without a time stamp."""
         self._number += 1
 
     def time(self, log_time_ns: int, stamp_ns: int | None) -> int | None:
-        """Return the simulation time of the message counted last; ns. ``None`` means unknown."""
+        """Return the simulation time of the message that was counted last; ns. ``None`` if it is unknown."""
         if self._clock is None:
             self.untimed += 1
             return log_time_ns
@@ -156,7 +156,7 @@ class StampReader:
         return time_ns
 
     def beside(self, log_time_ns: int, stamp_ns: int | None) -> int:
-        """Return the simulation time of a message that belongs to another channel; ns."""
+        """Return the simulation time of a message of another channel; ns."""
         expected, stamp_ns = log_time_ns - self._offset, _valid(stamp_ns)
         if self._clock is None:
             return log_time_ns
@@ -166,7 +166,7 @@ class StampReader:
         return stamp_ns if stamp_ns is not None and same_clock else expected
 
     def _unstamped(self, log_time_ns: int, stamp_ns: int | None) -> int | None:
-        """Return the simulation time of a message without a time stamp or with a stamp of 0; ns."""
+        """Return the simulation time of a message with a missing time stamp, or with a stamp of 0; ns."""
         while self._at < len(self._runs) and self._runs[self._at].last < self._number:
             self._at += 1
         run = self._runs[self._at] if self._at < len(self._runs) else None
@@ -182,7 +182,7 @@ class StampReader:
         return _between(log_time_ns, before, behind)
 
     def _placed(self, run: _Unstamped, log_time_ns: int) -> int | None:
-        """Return the time of a message between two stamps, from its position in a file without log times."""
+        """In a file without log times, estimate a message's time from its position between two time stamps."""
         before, behind = run.before, run.behind
         if before is None:
             return None
@@ -192,7 +192,7 @@ class StampReader:
         return before[1] + (behind[1] - before[1]) * share[0] // share[1]
 
     def _is_time(self, before: Known | None, behind: Known | None) -> bool:
-        """Return True if a time stamp of 0 is a real time, and False if it means a missing time."""
+        """Return True if a time stamp of 0 is a real time; False if it means that the time is missing."""
         stamps = self._stamps
         if before is None and behind is None:
             return True  # Without another clock, 0 is a time.
@@ -204,7 +204,7 @@ class StampReader:
 
 
 def late_reason(count: int, first_ns: int) -> str:
-    """Return the reason of the loss of time stamps beyond :data:`LATEST_NS`."""
+    """Return as text why time stamps beyond :data:`LATEST_NS` count as missing."""
     year = 2262 if abs(first_ns) >= 1 << 63 else 2116
     when = f"after the year {year}" if first_ns > 0 else "before the year 1824"
     return f"{count} time stamps are {when} ({first_ns / 1e9:.6g} s): they count as missing"

@@ -80,7 +80,7 @@ def _declared(kind: Type) -> str:
 
 
 def _leaves(kind: Struct, path: str = "", depth: int = 1) -> Iterator[tuple[str, Type]]:
-    """Yield the fields of a structure type with their paths. Structures nested too deeply are one field."""
+    """Yield path and type of each field in a structure. A structure that is nested too deeply is one field."""
     for name, inner in kind.fields:
         at = f"{path}.{name}" if path else name
         if isinstance(inner, Struct) and depth < MAX_DEPTH:
@@ -160,7 +160,7 @@ class CdrColumns:
     def _alike(
         self, data: bytes, size: int, count: int, losses: Losses
     ) -> Iterator[tuple[NDArray[np.intp], dict[str, Column]]]:
-        """Divide messages of one size into groups with the same layout. Yield row numbers and columns.
+        """Group messages of one size by their layout. Yield the row numbers and columns of each group.
 
         After :data:`MAX_LAYOUTS` groups, the rest is decoded one by one. Otherwise, time would grow with the
         square of the number of layouts.
@@ -211,7 +211,7 @@ class CdrColumns:
 
 
 def _is_flat(kind: Type) -> bool:
-    """True if the byte positions in a field depend on at most one length."""
+    """True if at most one length in the message determines the byte positions of a field."""
     return isinstance(kind.element if isinstance(kind, Sequence) else kind, Number) or isinstance(
         kind, Text
     )
@@ -219,7 +219,7 @@ def _is_flat(kind: Type) -> bool:
 
 @dataclass(slots=True)
 class _MessageLayout:
-    """Byte positions of all fields in messages with the same lengths.
+    """Byte positions of all fields, for messages with the same lengths of lists and texts.
 
     ``head``: first bytes; ``prefixes``: position and value of each length; ``numbers``: column, position,
     number of elements (-1: no list), type; ``texts``: column, position, size.
@@ -237,7 +237,7 @@ class _MessageLayout:
     def learn(
         cls, kind: Struct, data: memoryview, columns: dict[tuple[str, ...], str]
     ) -> _MessageLayout:
-        """Decode one message, and return the positions of its fields."""
+        """Decode a message. Return the positions of its fields."""
         reader = MessageReader.of(data)
         layout = cls(bytes(data[:HEAD]), reader.order)
         layout._step(reader, kind, (), columns)
@@ -277,7 +277,7 @@ class _MessageLayout:
         return size
 
     def agreeing(self, data: bytes, size: int, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Return a mask of the messages that have this layout."""
+        """Return a mask of the messages with this layout."""
         count = len(data) // size
         heads = np.ndarray((count,), f"V{HEAD}", data, 0, (size,))[rows]
         found = heads.view(np.uint32) == np.frombuffer(self.head, np.uint32)[0]
@@ -289,7 +289,7 @@ class _MessageLayout:
     def read(
         self, data: bytes, size: int, rows: NDArray[np.intp], losses: Losses
     ) -> dict[str, Column]:
-        """Return the columns of messages with this layout."""
+        """Return the columns of messages that have this layout."""
         count = len(data) // size
         whole = len(rows) == count
         found: dict[str, Column] = {}
@@ -315,7 +315,7 @@ class _MessageLayout:
 def _texts(
     data: bytes, size: int, place: int, length: int, rows: NDArray[np.intp], losses: Losses
 ) -> Column:
-    """Return texts of equal length that are at the same position in all given messages."""
+    """Return the texts at one position of all given messages. They have the same length."""
     column = np.full(len(rows), "", object)
     if length > MAX_TEXT:
         losses.values += len(rows)

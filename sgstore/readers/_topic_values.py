@@ -1,4 +1,4 @@
-"""Values of topics as columns: arrays of numbers, or texts that the database converts to the type of a field.
+"""Values of topics as columns: arrays of numbers, or texts that the database converts to the field's type.
 
 Message data are untrusted. A value that is too large is missing, and counted.
 """
@@ -53,7 +53,7 @@ _CONTROL: Final = re.compile(r"[\x00-\x1f\x7f\ud800-\udfff]")
 
 @dataclass(slots=True)
 class TopicNames:
-    """Names of the columns of a topic. Two names never differ only by case.
+    """Column names of a topic. Names that differ only by case are made different.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class TopicNames:
     _folded: set[str] = field(default_factory=lambda: {*OWN})
 
     def of(self, path: str) -> str:
-        """Return the column of a field. ``_`` is appended to a name that another column has."""
+        """Return the column name of a field. If another column has the name, append ``_``."""
         if (known := self.taken.get(path)) is not None:
             return known
         name = _CONTROL.sub("?", path)[:200] or "_"
@@ -78,7 +78,7 @@ class TopicNames:
 
 @dataclass(slots=True)
 class Losses:
-    """Counts of messages and values of a topic that are not decoded.
+    """Counts of the messages and values of a topic that could not be decoded.
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ class Losses:
         self.reason = self.reason or " ".join(str(reason).split())[:200]
 
     def texts(self) -> list[str]:
-        """Return the lost messages and values, each as a clause."""
+        """Return a text for each kind of loss: number of messages, number of values."""
         found: list[str] = []
         if self.messages:
             found.append(f"{self.messages} messages cannot be decoded, the first: {self.reason}")
@@ -109,7 +109,7 @@ class Losses:
 
 
 def column_of(declared: str, values: Sequence[Any], losses: Losses) -> Column:
-    """Return Python values of a field as a column of its database type. ``None`` means missing."""
+    """Return Python values of a field as a column of its database type; ``None`` is a missing value."""
     if (kind := NUMPY.get(declared)) is not None:
         return _numbers(kind, values, losses)
     column = np.empty(len(values), object)
@@ -158,12 +158,12 @@ def _text(declared: str, value: Any, losses: Losses) -> str | None:
 
 
 def _without_nan(numbers: str) -> str:
-    """Return the text of a list with NaN replaced by missing values, as in a column of numbers."""
+    """Return the text of a list of numbers with ``null`` instead of ``NaN``."""
     return numbers.replace("NaN", "null")
 
 
 def plain_text(text: str) -> str:
-    """Return a text without surrogates, which UTF-8 cannot encode."""
+    """Return a text with surrogates replaced, because UTF-8 cannot encode them."""
     if text.isascii():
         return text
     return text.encode("utf-8", "replace").decode()
@@ -183,7 +183,7 @@ def _json_value(value: Any) -> Any:
 
 
 def list_column(declared: str, rows: Column, losses: Losses) -> Column:
-    """Return lists of numbers (n, length) as texts, if the lists are long or the field contains bytes."""
+    """Return lists of numbers (n, length) as they are; as texts if they are long or contain bytes."""
     if rows.shape[1] > MAX_VALUE:
         losses.values += len(rows)
         return np.full(len(rows), None, object)
@@ -198,7 +198,7 @@ def list_column(declared: str, rows: Column, losses: Losses) -> Column:
 def joined_columns(
     declared: str, count: int, parts: Iterable[tuple[NDArray[np.intp], Column]], losses: Losses
 ) -> Column:
-    """Return one column that is joined from parts, each with its row numbers.
+    """Join several parts of a column, each with its row numbers, into one column.
 
     Lists of different lengths become texts.
     """
@@ -221,7 +221,7 @@ MAX_LISTED: Final = 64
 
 
 def _is_short(declared: str, values: Column) -> bool:
-    """True if a column needs no conversion to texts."""
+    """True if the values of a column need not be converted to texts."""
     return values.ndim == 1 or (declared != "BLOB" and 0 < values.shape[1] <= MAX_LISTED)
 
 
@@ -243,7 +243,7 @@ _OF_LISTS: Final = {"", "BOOLEAN", "BIGINT", "DOUBLE", "VARCHAR"}
 
 
 def wider(kinds: Iterable[str]) -> str:
-    """Return the common database type for JSON values of several types. An empty list has the type ``[]``."""
+    """Return the database type that fits several types of JSON values. An empty list has the type ``[]``."""
     found = {*kinds}
     if len(found) == 1:
         return found.pop()
@@ -258,7 +258,7 @@ def wider(kinds: Iterable[str]) -> str:
 
 
 def as_number(value: Any) -> Any:
-    """Return a JSON number that fits into a double. Too large integers become infinite."""
+    """Return a JSON number that fits into a double. Integers that are too large become infinite."""
     try:
         return float(value)
     except OverflowError:

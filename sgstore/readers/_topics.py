@@ -72,7 +72,7 @@ class TopicColumns(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class TopicBatch:
-    """Some messages of a topic as columns.
+    """Several messages of one topic, as columns.
 
     Attributes
     ----------
@@ -91,7 +91,7 @@ class TopicBatch:
     columns: Columns
 
     def take(self, rows: NDArray[np.intp]) -> TopicBatch:
-        """Return the batch reduced to the given rows."""
+        """Return the batch with only the given rows."""
         columns = {name: (kind, values[rows]) for name, (kind, values) in self.columns.items()}
         stamps = self.number[rows], self.log_time_ns[rows], self.publish_time_ns[rows]
         return TopicBatch(self.topic, *stamps, columns)
@@ -140,7 +140,7 @@ class ProtobufColumns:
     def _node(
         self, of: Descriptor, path: str, above: tuple[str, ...]
     ) -> list[tuple[FieldDescriptor, Any]]:
-        """Return the fields of a message type, each with its column number or with its own fields."""
+        """Return the fields of a message type. Each has its column number, or its own fields."""
         found: list[tuple[FieldDescriptor, Any]] = []
         above = (*above, of.full_name)
         for one in of.fields:
@@ -225,7 +225,7 @@ _REPEATED: Final = 3
 
 
 def _plain(one: FieldDescriptor, value: Any) -> Any:
-    """Return a value of a protobuf field as plain values: enumerations by name, messages as dicts."""
+    """Return a protobuf value as plain Python values: enumerations as names, messages as dicts."""
     if _is_repeated(one):
         inner = one.message_type
         if inner is not None and inner.GetOptions().map_entry:
@@ -245,7 +245,7 @@ def _single(one: FieldDescriptor, value: Any) -> Any:
 
 
 class JsonColumns:
-    """Decoder of JSON messages into columns. Fields come from the schema and from the messages.
+    """Decoder of JSON messages into columns. The fields come from the schema and from the messages.
 
     Parameters
     ----------
@@ -265,13 +265,13 @@ class JsonColumns:
 
     @property
     def fields(self) -> Mapping[str, TopicField]:
-        """Fields by name, so far."""
+        """Fields known so far, by name."""
         return field_list(
             (self._names.of(path), _stored_type(kind)) for path, kind in self._types.items() if kind
         )
 
     def _declare(self, schema: Any, path: str, depth: int) -> None:
-        """Add the fields of a JSON schema. Fields without a single plain type come from the messages."""
+        """Add the fields of a JSON schema. If a field has several types, the messages determine its type."""
         properties = schema.get("properties") if isinstance(schema, dict) else None
         if depth > MAX_DEPTH or not isinstance(properties, dict):
             return
@@ -310,7 +310,7 @@ class JsonColumns:
         }, np.array(rows, np.intp)
 
     def _learn(self, flat: list[dict[str, Any]], losses: Losses) -> None:
-        """Add the fields of some messages, and widen the types of known fields."""
+        """Add the fields of some messages. If values do not fit the type of a field, use a wider type."""
         for record in flat:
             for path, value in record.items():
                 if value is None:
@@ -332,7 +332,7 @@ class JsonColumns:
 
 
 def _stored_type(kind: str) -> str:
-    """Return the type of a column. Lists that are all empty so far count as lists of numbers."""
+    """Return the type of a column. Lists that have all been empty so far count as lists of numbers."""
     return "DOUBLE[]" if kind == "[]" else kind
 
 
@@ -379,7 +379,7 @@ def _check_size(data: memoryview) -> None:
 
 @dataclass(slots=True)
 class _Waiting:
-    """Messages of a topic that are collected for the next batch."""
+    """Messages of a topic that wait for the next batch."""
 
     data: list[bytes] = field(default_factory=list[bytes])
     stamps: list[Ints] = field(default_factory=list["Ints"])
@@ -389,7 +389,7 @@ class _Waiting:
 
 
 class TopicReading:
-    """Reading of some topics of an open recording, as columns.
+    """Reader of some topics of an open recording, as columns.
 
     Several channels of one topic are one topic.
 
@@ -446,7 +446,7 @@ class TopicReading:
         return schema.name if schema else "", record.message_encoding
 
     def fields(self, topic: str) -> Mapping[str, TopicField] | None:
-        """Return the fields of a topic by name. ``None`` means unknown before the reading (JSON)."""
+        """Return the fields of a topic by name; ``None`` if they are unknown before reading (JSON)."""
         found: dict[str, TopicField] = {}
         for number in (number for number, name in self.channels.items() if name == topic):
             if isinstance(self.decoders[number], JsonColumns):
@@ -490,7 +490,7 @@ class TopicReading:
 
 
 def topics_of(recording: Recording) -> dict[str, TopicFacts]:
-    """Return the topics of a recording, by name. Their fields are not known."""
+    """Return the topics of a recording by name, without their fields."""
     found: dict[str, TopicFacts] = {}
     for record in recording.channels.values():
         schema = recording.schemas.get(record.schema_id)
@@ -503,7 +503,7 @@ def topics_of(recording: Recording) -> dict[str, TopicFacts]:
 
 
 def _pieces(rows: NDArray[np.intp], lengths: Ints, most: int) -> Iterator[NDArray[np.intp]]:
-    """Cut row numbers into pieces of a bounded number of bytes."""
+    """Split row numbers into pieces, each with a limited number of bytes."""
     cuts = np.flatnonzero(np.diff(np.cumsum(lengths) // most)) + 1
     yield from np.split(rows, cuts)
 
@@ -517,7 +517,7 @@ def _hold(held: _Waiting, run: Messages, rows: NDArray[np.intp]) -> None:
 
 
 def _joined(run: Messages, rows: NDArray[np.intp]) -> bytes:
-    """Return the data of the given messages as one sequence of bytes."""
+    """Return the data of the given messages, joined into one bytes object."""
     if type(run) is not Messages:
         return b"".join(map(run.data, rows.tolist()))
     starts = run.offset[rows] + MESSAGE_HEAD.itemsize

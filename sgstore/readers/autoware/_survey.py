@@ -1,4 +1,4 @@
-"""First pass over an Autoware recording: find the object channel, object classes and ego pose channel.
+"""First reading of an Autoware recording: find the channels of objects and ego pose, and object classes.
 
 Topics are arbitrary, so only the schemas count. The class of an object may change between messages; the most
 frequent one is used.
@@ -91,7 +91,7 @@ CLASS_COLUMNS: Final = (*_UUID, *_CLASSES)
 
 @dataclass(slots=True)
 class ObjectLead(Lead):
-    """Channel with lists of objects in an Autoware recording, as a candidate for the frames of the trace.
+    """Channel of an Autoware recording with lists of objects. It may become the frame channel.
 
     ``order`` is the priority of its list type, ``objects`` its total number of objects.
     """
@@ -101,7 +101,7 @@ class ObjectLead(Lead):
 
 
 def content_of(recording: Recording, channel: int) -> str:
-    """Return the content type of an Autoware channel (such as objects or poses); empty if unsupported."""
+    """Return the type of content of an Autoware channel (such as objects); empty if it is not supported."""
     return CONTENTS.get(ros_name(recording, channel), "")
 
 
@@ -128,14 +128,14 @@ def labels_of(table: Floats) -> list[str]:
 
 
 def stamp_at(told: dict[str, Any], path: str) -> int | None:
-    """Return the time stamp at a path of a decoded message; ns. ``None`` means missing or out of range."""
+    """Return the time stamp at a path of a decoded message; ns. ``None`` if missing or out of range."""
     seconds, nanos = (number(told, f"{path}.{part}") for part in ("sec", "nanosec"))
     there = 0 <= seconds < 1 << 32 and 0 <= nanos < 1 << 32
     return int(seconds) * 1_000_000_000 + int(nanos) if there else None
 
 
 class AutowareSurvey(Survey[ObjectLead]):
-    """First pass over an Autoware recording, which collects the facts that the frames need.
+    """First reading of an Autoware recording. It collects information that the frames need.
 
     Attributes
     ----------
@@ -164,7 +164,7 @@ class AutowareSurvey(Survey[ObjectLead]):
         self._looks = 0
 
     def rank(self, lead: ObjectLead) -> tuple[int, ...]:
-        """Return the sort key of a channel for the choice of the frame channel. The greatest key wins."""
+        """Return the sort key of a channel. The channel with the greatest key becomes the frame channel."""
         return lead.objects > 0, lead.order, lead.frames
 
     def label_of(self, ident: str, first: str) -> str:
@@ -173,7 +173,7 @@ class AutowareSurvey(Survey[ObjectLead]):
         return max(counts, key=counts.__getitem__) if counts else first
 
     def find_ego(self) -> str:
-        """Find the channel and coordinate axes of the ego pose, and return the id of the ego."""
+        """Find the channel and coordinate axes of the ego pose. Return the id of the ego."""
         found = [
             (parent != MAP, child != "base_link", -count, self.topic(channel), channel)
             for channel, (parent, child, count) in self._poses.items()
@@ -201,7 +201,7 @@ class AutowareSurvey(Survey[ObjectLead]):
         return "lasting" if static else super().role(channel)
 
     def context(self) -> list[Ref]:
-        """Return the file positions of static transforms and calibrations, which later messages need."""
+        """Return the file positions of static transforms and calibrations. Later messages need them."""
         return [*self._static, *super().context()]
 
     def meet(self, channel: int) -> bool:
@@ -209,7 +209,7 @@ class AutowareSurvey(Survey[ObjectLead]):
         return self._content(channel) in {OBJECTS, POSE_OF_EGO, TRANSFORMS}
 
     def keeps(self, channel: int) -> bool:
-        """Return True if the second pass, which builds the frames, needs the messages of a channel."""
+        """Return True if messages of a channel are needed in the second reading, which makes the frames."""
         return bool(self._content(channel))
 
     def _content(self, channel: int) -> str:
@@ -234,7 +234,7 @@ class AutowareSurvey(Survey[ObjectLead]):
             self.leads[channel] = ObjectLead(order=order, stamps=stamps)
 
     def look(self, run: Messages, row: int) -> None:
-        """Collect facts from one Autoware message. Unreadable messages are reported in the second pass."""
+        """Collect information from an Autoware message. Unreadable messages are reported later."""
         channel = int(run.channel[row])
         content = self.contents[channel]
         if content == OBJECTS:

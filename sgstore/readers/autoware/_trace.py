@@ -89,7 +89,7 @@ _CIRCLE, _OFF, _FLASHING = 1, 1, 3
 
 
 def _columns(predicted: bool) -> tuple[str, ...]:  # noqa: FBT001 (one of two definitions)
-    """Return the field paths of the numbers that the reader needs from an Autoware object."""
+    """Return the paths of the numeric fields that the reader needs from an Autoware object."""
     pose = f"{_TOLD[predicted]}.pose"
     twist = f"kinematics.{_TURNED[predicted]}.twist"
     pushed = f"kinematics.{_PUSHED[predicted]}.accel.linear"
@@ -119,7 +119,7 @@ _COVARIANCES: Final = {
 
 
 def _perceived(objects: Floats) -> list[dict[str, float]]:
-    """Return existence probability and covariances of each object. A zero counts as unknown."""
+    """Return existence probability and covariances of each object. A zero means unknown."""
     names = ("existence_probability", *_COVARIANCES)
     rows = objects[:, -len(names) :].tolist()
     return [{name: value for name, value in zip(names, row, strict=True) if value} for row in rows]
@@ -127,7 +127,7 @@ def _perceived(objects: Floats) -> list[dict[str, float]]:
 
 @dataclass(slots=True)
 class AutowareRawFrame:
-    """Frame of an Autoware recording before conversion, with objects in their original coordinate axes.
+    """Frame of an Autoware recording before conversion. Its objects have their original coordinate axes.
 
     Attributes
     ----------
@@ -165,7 +165,7 @@ class AutowareRawFrame:
 
 @dataclass(slots=True)
 class _Detection:
-    """Detected object of the previous list that has no id of its own."""
+    """Object without an id of its own in the previous list of detected objects."""
 
     ident: str
     label: str
@@ -219,7 +219,7 @@ class AutowareDecoder(SurveyedDecoder[AutowareRawFrame, AutowareSurvey]):
         self._followed = 0
 
     def decode(self, run: Messages, row: int) -> AutowareRawFrame | None:
-        """Return the raw frame of an Autoware message. ``None`` means not a frame, or unreadable."""
+        """Return the frame in an Autoware message, before conversion; ``None`` if no frame, or unreadable."""
         channel, log_time = int(run.channel[row]), int(run.log_time_ns[row])
         if channel in self._leading:
             self._stamps.next()
@@ -237,7 +237,7 @@ class AutowareDecoder(SurveyedDecoder[AutowareRawFrame, AutowareSurvey]):
         return None
 
     def complete(self, frames: list[AutowareRawFrame]) -> list[FrameRows]:
-        """Convert raw Autoware frames to frames with poses and speeds in fixed map axes."""
+        """Convert Autoware frames: compute poses and speeds in fixed map axes."""
         if frames and frames[-1] is self._open:  # The last frame.
             self._settle_open()
         return [self._rows(frame) for frame in frames]
@@ -255,7 +255,7 @@ class AutowareDecoder(SurveyedDecoder[AutowareRawFrame, AutowareSurvey]):
             warn("detected objects have no ids; they were tracked by position and class")
 
     def _takers(self) -> dict[int, Callable[[int, int, memoryview], None]]:
-        """Return the function that processes messages, for each channel other than the frame channel."""
+        """Return the function that processes the messages of each channel, except the frame channel."""
         takers = {
             TRANSFORMS: self._take_transforms,
             LIGHTS: self._take_lights,
@@ -275,7 +275,7 @@ class AutowareDecoder(SurveyedDecoder[AutowareRawFrame, AutowareSurvey]):
         return decode(self._survey.structures[channel], data)
 
     def _stamp(self, told: dict[str, Any], path: str, log_time: int) -> int:
-        """Return the simulation time of a message outside the frame channel; ns."""
+        """Return the simulation time of a message that is not in the frame channel; ns."""
         return self._stamps.beside(log_time, stamp_at(told, path))
 
     def _take_transforms(self, channel: int, log_time: int, data: memoryview) -> None:
@@ -389,7 +389,7 @@ class AutowareDecoder(SurveyedDecoder[AutowareRawFrame, AutowareSurvey]):
         return state if abs(stamp - told) <= _LIT_NS else LIGHT_STATE_CODE["unknown"]
 
     def _reported(self, stamp: int) -> tuple[int, float]:
-        """Return the lights (mask) and gear of the ego at a time, from recent vehicle messages."""
+        """Return the ego's lights (mask) and gear at a time, from recent vehicle messages."""
         now = {
             what: value
             for what, (told, value) in self._reports.items()
@@ -404,7 +404,7 @@ class AutowareDecoder(SurveyedDecoder[AutowareRawFrame, AutowareSurvey]):
         return mask, _gear_of(now.get(GEAR, 0))
 
     def _follow(self, stamp: int, labels: list[str], table: Floats, told: list[str]) -> list[str]:
-        """Return ids for detections without ids: the id of the nearest previous detection, or a new id."""
+        """Return ids for detected objects without id: that of the nearest previous object, or a new one."""
         before_ns, before = self._seen
         lapse = min(max(stamp - before_ns, 0), _LIT_NS) / 1e9
         places = table[:, _BOX_BEGINS : _BOX_BEGINS + 2]
@@ -435,7 +435,7 @@ class AutowareDecoder(SurveyedDecoder[AutowareRawFrame, AutowareSurvey]):
         return idents
 
     def _measure(self, table: Floats, data: memoryview) -> None:
-        """Set length, width and centre of objects with a polygon shape, from the polygon's corners."""
+        """For objects with a polygon as shape, compute length, width and centre from the corners."""
         told = records(self._decoded(self._survey.leading, data), "objects")
         for row, one in enumerate(told[: len(table)]):
             corners = records(one, "shape.footprint.points")
@@ -450,7 +450,7 @@ class AutowareDecoder(SurveyedDecoder[AutowareRawFrame, AutowareSurvey]):
             table[row, _BOX_BEGINS : _BOX_BEGINS + 3] += np.nan_to_num(turn @ middle)
 
     def _settle_open(self) -> None:
-        """Compute the ego pose and motion of the last frame from all messages read so far."""
+        """Compute pose and motion of the ego in the last frame, from all messages read so far."""
         frame, self._open = self._open, None
         if frame is None:
             return
@@ -482,7 +482,7 @@ class AutowareDecoder(SurveyedDecoder[AutowareRawFrame, AutowareSurvey]):
         return place + rotated(turn, motion[:3]) * (late / 1e9), product(turn, further)
 
     def _base_at(self, frame: AutowareRawFrame) -> Pose | None:
-        """Return the pose, in map axes, of the coordinate axes of a frame's objects; ``None`` if unknown."""
+        """Return the pose in map axes of the axes that a frame's objects use; ``None`` if unknown."""
         survey = self._survey
         if frame.axes == survey.world:
             return np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
@@ -607,7 +607,7 @@ def _pose_at(told: dict[str, Any], place: str, turn: str) -> Pose | None:
 
 
 def _state_of(elements: Iterable[dict[str, Any]]) -> str:
-    """Return the state of a group of traffic lights: of its round lights, else of its arrows."""
+    """Return the state of a group of traffic lights: that of its round lights, or else of its arrows."""
     told = [{key: number(one, key) for key in ("color", "shape", "status")} for one in elements]
     told = [one for one in told if one["shape"] == _CIRCLE] or told
     if any(one["status"] == _FLASHING for one in told):

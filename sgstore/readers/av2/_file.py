@@ -1,4 +1,4 @@
-"""Log of Argoverse 2 (a folder) with the interface of an MCAP file: a map message, and one message per sweep.
+"""Log of Argoverse 2 (a folder), read like an MCAP file: a map message, and a message per sweep.
 
 The annotations are boxes in the axes of the ego, and are converted to those of the city. The ego is annotated
 in some logs only. Otherwise, its box is assumed.
@@ -55,7 +55,7 @@ _SCHEMA: Final = b'{"type":"object"}'
 
 
 class Av2File(NumberedFile):
-    """Log of Argoverse 2 with the interface of an MCAP file (log of messages).
+    """Log of Argoverse 2 that can be read like an MCAP file (log of messages).
 
     Parameters
     ----------
@@ -95,19 +95,19 @@ class Av2File(NumberedFile):
         self.losses += lost
 
     def message(self, number: int) -> bytes:
-        """Return the bytes of a message by number: 0 is the map, 1 and higher are the sweeps."""
+        """Return the bytes of the message with a number: 0 is the map, the others are sweeps."""
         if number == 0:
             return self._map
         rows = self._steps[number - 1].tolist()
         return self._boxes.message(self.time_of(number), self._ego or EGO, rows)
 
     def time_of(self, number: int) -> int:
-        """Return the time of a sweep by number, from 1; ns."""
+        """Return the time of the sweep with a number, from 1; ns."""
         return int(self._times[self._steps[number - 1][0]])
 
 
 def _read_boxes(annotations: Path, poses: Path, lost: list[str]) -> tuple[str, Boxes, Any]:
-    """Return the id of the ego, all boxes of a log in the axes of the city, and their times; ns.
+    """Return the ego's id, all boxes of a log in city axes, and the time of each box; ns.
 
     A log without the box of the ego has an assumed one at each time. The id is then empty.
     """
@@ -134,7 +134,7 @@ def _read_boxes(annotations: Path, poses: Path, lost: list[str]) -> tuple[str, B
 
 
 def _usable(boxes: Boxes, times: Any, usable: Any, lost: list[str]) -> tuple[Boxes, Any]:
-    """Return the boxes and times in the mask ``usable``. Report the other boxes as lost."""
+    """Return the boxes and times that a mask selects. Report the other boxes as lost."""
     rows = np.flatnonzero(usable).tolist()
     if len(rows) < len(usable):
         count = len(usable) - len(rows)
@@ -145,7 +145,7 @@ def _usable(boxes: Boxes, times: Any, usable: Any, lost: list[str]) -> tuple[Box
 
 
 def _first_of_its_frame(times: Any, ident: list[str]) -> Any:
-    """Return a mask that is True at the first row of each object in each frame."""
+    """Return a mask: True at the first row of each object in each frame."""
     first = dict[tuple[int, str], int]()
     for row, key in enumerate(zip(times.tolist(), ident, strict=True)):
         first.setdefault(key, row)
@@ -155,7 +155,7 @@ def _first_of_its_frame(times: Any, ident: list[str]) -> Any:
 
 
 def _poses_at(path: Path, times: Any, lost: list[str]) -> Floats:
-    """Return the pose of the ego at each time: position and quaternion. NaN means unknown."""
+    """Return the pose of the ego at each time: position and quaternion. NaN if it is unknown."""
     table = read_arrow_file(path, ("timestamp_ns", *_TURN, *_PLACE), lost.append)
     told, at = numbers(table, (*_PLACE, *_TURN)), _times_of(table)
     told[:, 3:] = unit(told[:, 3:])
@@ -172,7 +172,7 @@ def _times_of(table: Any) -> Any:
 
 
 def _read_map(path: Path, lost: list[str]) -> bytes:
-    """Return the road map as a text of lanes. A damaged map is reported as lost."""
+    """Return the road map as text in the lane text format. A damaged map is reported as lost."""
     try:
         return map_text(json.loads(path.read_bytes())).encode()
     except (

@@ -28,7 +28,7 @@ _UNKNOWN: Final = {"", "UNKNOWN"}
 
 
 def map_text(told: dict[str, Any]) -> str:
-    """Return the road map of a log as a text of lanes; empty without lanes.
+    """Return the road map of a log as text in the lane text format; empty without lanes.
 
     Raises
     ------
@@ -57,7 +57,7 @@ def map_text(told: dict[str, Any]) -> str:
 
 
 def _polyline(told: list[dict[str, float]]) -> Any:
-    """Return the points of a border (n, 3), without repeated points."""
+    """Return the points of a border (n, 3). Repeated points are removed."""
     line = np.array([[one["x"], one["y"], one["z"]] for one in told], np.float64).reshape(-1, 3)
     if not (np.abs(line) < 1e8).all():
         raise MapError("a border has an impossible point")
@@ -86,12 +86,12 @@ def _line(segments: dict[str, Any], one: dict[str, Any], left: Any, right: Any) 
 
 
 def _known(segments: dict[str, Any], idents: Any) -> list[str]:
-    """Return the ids that exist in this map. A map contains only the surroundings of a log."""
+    """Return those ids that exist in this map. A map covers only the surroundings of its log."""
     return [str(ident) for ident in idents or () if str(ident) in segments]
 
 
 def _crossed(mark: str) -> tuple[bool | None, bool | None]:
-    """Return the permissions to cross a marking to the left and to the right.
+    """Return two permissions for a marking: to cross it to the left, and to the right.
 
     ``DASHED_SOLID``: the line at the left is dashed, that at the right is solid.
     """
@@ -107,7 +107,7 @@ def _crossed(mark: str) -> tuple[bool | None, bool | None]:
 
 
 def _crosswalk(one: dict[str, Any]) -> PlainCrosswalk:
-    """Return a crosswalk from its two edges, even if their directions are opposite."""
+    """Return a crosswalk made from its two edges. Their directions may be opposite."""
     first, last = _polyline(one["edge1"]), _polyline(one["edge2"])
     if np.dot(first[-1, :2] - first[0, :2], last[-1, :2] - last[0, :2]) > 0:
         last = last[::-1]

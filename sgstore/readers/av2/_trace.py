@@ -22,5 +22,5 @@ class Av2Trace(BoxesTrace):
 
     @staticmethod
     def role(channel: Channel) -> str:
-        """Return the role of a channel: ``ground_truth`` for sweeps, ``map``, else ``payload``."""
+        """Return the role of a channel: ``ground_truth`` for sweeps, ``map``, or otherwise ``payload``."""
         return {FRAME: "ground_truth", MAP: "map"}.get(channel.schema, "payload")

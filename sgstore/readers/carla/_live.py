@@ -1,4 +1,4 @@
-"""Access to a running CARLA simulator: frames of the world and sensor data, in the axes of sgstore.
+"""Access to a running CARLA simulator: frames of its world and sensor data, in the axes of sgstore.
 
 ::
 
@@ -114,7 +114,7 @@ def connect(host: str = "localhost", port: int = 2000, timeout_s: float = TIMEOU
 
 @dataclass(frozen=True, slots=True)
 class _Actor:
-    """Constant properties of a CARLA actor, such as type and bounding box.
+    """Properties of a CARLA actor that do not change, such as type and bounding box.
 
     Attributes
     ----------
@@ -179,7 +179,7 @@ class LiveWorld:
 
     @cached_property
     def road_map(self) -> RoadMap:
-        """Road map of the CARLA world, parsed at the first use.
+        """Road map of the CARLA world. It is parsed when first used.
 
         Raises
         ------
@@ -190,7 +190,7 @@ class LiveWorld:
 
     @property
     def warnings(self) -> list[str]:
-        """Warnings so far about traffic lights that may be assigned to a wrong signal of the map."""
+        """Warnings so far about traffic lights whose map signal may be wrong."""
         if self._at_once is None:
             return []
         return [*shared_signals(self._heads, self.road_map), *self._at_once.warnings]
@@ -219,7 +219,7 @@ class LiveWorld:
             raise TraceError(f"the CARLA server does not answer: {error}") from error
 
     def find_ego(self) -> Any:
-        """Return the ego as a ``carla.Vehicle`` without reading a new frame, or ``None``."""
+        """Return the ego as a ``carla.Vehicle``, without reading a new frame; ``None`` without an ego."""
         try:
             here = self._here({state.id for state in self.world.get_snapshot()})
         except RuntimeError as error:
@@ -228,7 +228,7 @@ class LiveWorld:
         return None if ego is None else here[ego].handle
 
     def _here(self, present: set[int]) -> dict[int, _Actor]:
-        """Return the present CARLA actors that are objects of the scene, by actor id."""
+        """Return those CARLA actors that are now objects of the scene, by actor id."""
         self._look(present)
         return {i: a for i in sorted(present) if (a := self._actors[i]) is not None}
 
@@ -249,7 +249,7 @@ class LiveWorld:
         return frame
 
     def _look(self, present: set[int]) -> None:
-        """Request the properties of new CARLA actors, and drop removed actors."""
+        """Request the properties of new CARLA actors, and forget actors that have disappeared."""
         for ident in self._actors.keys() - present:
             del self._actors[ident]
             self._heads.pop(ident, None)
@@ -275,7 +275,7 @@ class LiveWorld:
         return None
 
     def _signals(self, actors: Mapping[int, Any]) -> dict[int, str]:
-        """Return the id of the map signal for each traffic light and sign, by actor id.
+        """Return the map signal of each traffic light and sign: actor id → id of the signal.
 
         A light may know its signal. Otherwise, it is matched as in a recording
         (:mod:`sgstore.readers.carla._signals`), by position or by the lanes of its stop waypoints.
@@ -297,7 +297,7 @@ class LiveWorld:
         return found | self._heads
 
     def _watch(self, here: Mapping[int, _Actor]) -> None:
-        """Check the traffic lights for contradictions: red and green for the same lane."""
+        """Check whether traffic lights contradict each other: red and green for the same lane."""
         heads = [ident for ident, actor in here.items() if actor.type_name == TRAFFIC_LIGHT]
         if not heads:
             return
@@ -322,7 +322,7 @@ class LiveWorld:
 
     @cached_property
     def _level(self) -> list[tuple[str, str, tuple[float, float, float], dict[str, Any]]]:
-        """Return id, kind, position and other properties of the objects in the CARLA level."""
+        """Return the objects in the CARLA level with id, kind, position and other properties."""
         found: list[tuple[str, str, tuple[float, float, float], dict[str, Any]]] = []
         for thing in self.world.get_environment_objects():
             label = str(thing.type)
@@ -349,7 +349,7 @@ class LiveWorld:
 
 
 def _described(handle: Any, map_ref: str) -> _Actor:
-    """Request the constant properties of a CARLA actor from the server."""
+    """Request from the server the properties of a CARLA actor that do not change."""
     type_name = str(handle.type_id)
     return _Actor(
         handle=handle,
@@ -466,7 +466,7 @@ def _shown(light: Any) -> str:
 
 
 def _light(actor: Any) -> Light:
-    """Return the pose and stop positions of a CARLA traffic light, for the search of its map signal."""
+    """Return the pose and stop positions of a CARLA traffic light, to find its map signal."""
     transform = actor.get_transform()
     place, heading = transform.location, math.radians(-transform.rotation.yaw)
     stops: list[tuple[float, ...]] = []
@@ -744,7 +744,7 @@ def reading_of(name: str, data: Any) -> SensorReading:
 
 
 def _radar(data: Any) -> np.ndarray[Any, np.dtype[Any]]:
-    """Convert CARLA radar detections (velocity, angles, depth) into points."""
+    """Convert detections of a CARLA radar (velocity, angles, depth) into points."""
     told = np.frombuffer(data.raw_data, "<f4").reshape(-1, 4).astype(np.float64)
     velocity, altitude, azimuth, depth = told.T
     points = np.zeros(len(told), RADAR)

@@ -67,7 +67,7 @@ class CarlaRecorderTrace(FramesTrace):
         self.info = replace(self.info, map_name=next(filter(None, towns), ""))
 
     def ego_named(self, name: str) -> str:
-        """Return the id of the actor with an id or role name.
+        """Return the id of the actor that has a given id or role name.
 
         Raises
         ------
@@ -92,7 +92,7 @@ class CarlaRecorderTrace(FramesTrace):
 
     @staticmethod
     def role(channel: Channel) -> str:
-        """Return the role of a channel: ``ground_truth`` for frames, else ``payload``."""
+        """Return the role of a channel: ``ground_truth`` for frames, otherwise ``payload``."""
         return "ground_truth" if channel.schema == FRAME else "payload"
 
     def on_map(self, road_map: RoadMap | None) -> None:
@@ -102,7 +102,7 @@ class CarlaRecorderTrace(FramesTrace):
             self._signals = signals_of(self._places, road_map)
 
     def decoder(self, report: TraceReport) -> Any:
-        """Return a new decoder of frames, and add the warnings about traffic lights to a report."""
+        """Return a new decoder of frames. Add the warnings about traffic lights to a report."""
         self._report = report
         if self._road_map is not None:
             report.warnings += shared_signals(self._signals, self._road_map)
@@ -163,7 +163,7 @@ class CarlaRecorderTrace(FramesTrace):
             frame.entities.append(entity._replace(own={**(entity.own or {}), **own}))
 
     def _add_light(self, frame: Frame, one: dict[str, Any]) -> None:
-        """Add a traffic light to a frame. Its box is not added, because the box is an area on the road."""
+        """Add a traffic light to a frame, without its box. Such a box is an area on the road."""
         ident, (x, y, z), yaw = one["id"], one["location"], one["rotation"][2]
         self._places.setdefault(ident, Light(x, -y, z, math.radians(-yaw)))
         bare = {key: value for key, value in one.items() if key != "box"}
@@ -179,7 +179,7 @@ def _actors(data: Any) -> list[dict[str, Any]]:
 
 
 def _transform(one: dict[str, Any]) -> Any:
-    """Return the pose of an actor in the form of ``carla.Transform``."""
+    """Return the pose of an actor with the attributes of a ``carla.Transform``."""
     place = dict(zip("xyz", one["location"], strict=True))
     turn = dict(zip(("roll", "pitch", "yaw"), one["rotation"], strict=True))
     return SimpleNamespace(location=SimpleNamespace(**place), rotation=SimpleNamespace(**turn))
@@ -194,7 +194,7 @@ def _motion(one: dict[str, Any]) -> dict[str, float]:
 
 
 def _inputs(one: dict[str, Any]) -> dict[str, Any]:
-    """Return controls and lights of a vehicle. The sign of the steering is inverted."""
+    """Return controls and lights of a vehicle. The steering gets the opposite sign, as in sgstore."""
     told: dict[str, Any] = {}
     if "control" in one:
         told = dict(one["control"])

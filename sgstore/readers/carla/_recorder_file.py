@@ -1,4 +1,4 @@
-"""CARLA's recorder log (``client.start_recorder``) with the interface of an MCAP file: one message per frame.
+"""CARLA's recorder log (``client.start_recorder``), read like an MCAP file: one message per frame.
 
 The file is a sequence of packets. Some describe actors once, others have the values of a frame. A message is
 the JSON text of one frame, with the descriptions of its moving actors. Its axes are CARLA's (y to the right,
@@ -71,7 +71,7 @@ def is_recorder_log(path: Path) -> bool:
 
 
 class CarlaRecorderFile(MessageFile):
-    """Log of CARLA's recorder, with the interface of an MCAP file (log of messages).
+    """Log of CARLA's recorder that can be read like an MCAP file (log of messages).
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ class CarlaRecorderFile(MessageFile):
         self._file.close()
 
     def _walk(self, report: Findings, wanted: Callable[[int], bool]) -> Iterator[Messages]:
-        """Yield all frames of the log as messages. The ``offset`` of a message is its position in the file."""
+        """Yield all frames of the log as messages. ``offset`` of a message is its position in the file."""
         if not wanted(-1):
             return
         moments = _moments(self._file, report)
@@ -122,7 +122,7 @@ class CarlaRecorderFile(MessageFile):
 
 
 def read_messages(path: Path, places: Iterable[tuple[int, int, int]]) -> Iterator[bytes]:
-    """Yield the messages of frames of a log, by their offsets and lengths; see :class:`CarlaRecorderFile`.
+    """Yield the bytes of frames in a log, given by offset and length; see :class:`CarlaRecorderFile`.
 
     Raises
     ------
@@ -148,7 +148,7 @@ def read_messages(path: Path, places: Iterable[tuple[int, int, int]]) -> Iterato
 
 
 def _town(file: BufferedReader) -> str:
-    """Read the head of a log, and return the name of the map. The file is then at the first packet."""
+    """Read the head of a log. Return the name of the map. The file is then at its first packet."""
     file.seek(0)
     head = file.read(len(_MAGIC) + 10)
     if not head.startswith(_MAGIC):
@@ -161,7 +161,7 @@ def _town(file: BufferedReader) -> str:
 
 
 class _LoggedActor(NamedTuple):
-    """Type and role of an actor, and its first pose (cm, degrees). Lights and signs have no other pose."""
+    """Type, role and first pose of an actor (cm, degrees). Lights and signs have only this pose."""
 
     type_name: str
     role: str
@@ -170,7 +170,7 @@ class _LoggedActor(NamedTuple):
 
 @dataclass(slots=True)
 class _LoggedWorld:
-    """Actors at one moment of a log, with their boxes, and the ids that earlier messages have described.
+    """Actors at one time of a log and their boxes, and the ids with a description in earlier packets.
 
     ``others``: ids of sensors and the spectator; ``unknown``: ids without a description.
     """
@@ -184,7 +184,7 @@ class _LoggedWorld:
 
 @dataclass(slots=True)
 class _Moment:
-    """All packets of one frame, with the actors that exist at that time.
+    """All packets of one frame of a log, and the actors that exist at that time.
 
     Attributes
     ----------
@@ -262,13 +262,13 @@ def _motion(ident: int, about: dict[int, dict[int, Any]]) -> dict[str, Any]:
 
 
 class _PacketReader:
-    """Reader of the packets in a log. After a damaged part, it searches for the next frame."""
+    """Reader of the packets in a log. After a damaged part, it continues with the next frame."""
 
     def __init__(self, file: BufferedReader, report: Findings) -> None:
         self.file, self.report = file, report
 
     def packet(self) -> tuple[int, int, bytes] | None:
-        """Return position, id and content of the next packet. ``None`` means the end, or damage."""
+        """Return position, id and content of the next packet; ``None`` at the end, or if it is damaged."""
         place = self.file.tell()
         head = self.file.read(_HEAD.size)
         if len(head) < _HEAD.size:
@@ -283,7 +283,7 @@ class _PacketReader:
         return place, ident, data
 
     def resync(self, after: int, last: int) -> bool:
-        """Move to the next frame after a position in the file. Its frame number must be above ``last``."""
+        """Go to the next frame after a position in the file. Its frame number must be above ``last``."""
         self.file.seek(after)
         rest, place = b"", after
         while piece := self.file.read(_PIECE):
@@ -337,13 +337,13 @@ def _moments(file: BufferedReader, report: Findings) -> Iterator[_Moment]:
 
 
 def _follows(data: bytes, last: int) -> bool:
-    """Return True if the data can be the frame after frame number ``last``."""
+    """Return True if the data can be the start of the frame after number ``last``."""
     number, _, elapsed = struct.unpack("<Qdd", data)
     return last < number <= last + _FURTHEST and 0 <= elapsed < 1e9
 
 
 def _whole(moment: _Moment | None, report: Findings) -> Iterator[_Moment]:
-    """Yield a frame if it has the positions of actors. Otherwise, count it as lost."""
+    """Yield a frame that has the positions of actors. Count any other frame as lost."""
     if moment is None:
         return
     if _POSES not in moment.tables:
@@ -359,7 +359,7 @@ def _whole(moment: _Moment | None, report: Findings) -> Iterator[_Moment]:
 
 
 def _take(moment: _Moment, ident: int, data: bytes) -> None:
-    """Add a packet to a frame, or to the descriptions of actors."""
+    """Add the content of a packet to a frame or to its actors."""
     world = moment.world
     if ident == _ADDED:
         _add_actors(world, data)
@@ -387,7 +387,7 @@ def _rows(data: bytes, layout: Any) -> Any:
 
 
 def _pairs(data: bytes) -> list[list[int]]:
-    """Return the pairs of actor ids that collide, without duplicates. The record size varies with CARLA."""
+    """Return the pairs of actor ids that collide, without duplicates. CARLA versions differ in record size."""
     (count,) = struct.unpack_from("<H", data)
     size = (len(data) - 2) // count if count else 12
     if size < 12 or len(data) != 2 + count * size:
@@ -397,7 +397,7 @@ def _pairs(data: bytes) -> list[list[int]]:
 
 
 def _add_actors(world: _LoggedWorld, data: bytes) -> None:
-    """Add the descriptions of new actors to a world."""
+    """Add new actors to the world, from their descriptions in a packet."""
     (count,) = struct.unpack_from("<H", data)
     at = 2
     for _ in range(count):

@@ -1,4 +1,4 @@
-"""Assignment of CARLA's traffic lights to the signals of the road map, by position.
+"""Assignment of CARLA's traffic lights to signals of the road map, by position.
 
 A light has at most one signal, and a signal at most one light. The steps are:
 
@@ -82,7 +82,7 @@ _RED, _GREEN = LIGHT_STATE_CODE["red"], LIGHT_STATE_CODE["green"]
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """CARLA traffic light with its pose and trigger boxes (areas where vehicles obey it).
+    """CARLA traffic light: its pose, and its trigger boxes (areas where vehicles obey it).
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ class Light:
 def signals_of(
     lights: Mapping[int, Light], road_map: RoadMap, told: Mapping[int, str] | None = None
 ) -> dict[int, str]:
-    """Return the map signal of each traffic light by id. Without a signal, the names of its lanes.
+    """Return the map signal of each traffic light by id. Without a signal: the names of its lanes.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ def signals_of(
 
 
 def sign_at(road_map: RoadMap, x: float, y: float) -> str:
-    """Return the name of the map's traffic sign at a position; empty without a sign."""
+    """Return the name of the traffic sign that the map has at a position; empty without a sign."""
     nodes = road_map.nodes
     codes = [KIND_CODE[kind] for kind in SIGNALS if kind != "traffic_light"]
     rows = np.flatnonzero(np.isin(nodes.kind, codes))
@@ -146,7 +146,7 @@ def sign_at(road_map: RoadMap, x: float, y: float) -> str:
 
 
 class _Rule(NamedTuple):
-    """Usual pose of a traffic light relative to its map signal: rotation, and offset ahead and to the left."""
+    """Usual pose of a traffic light relative to its map signal: rotation, and offset ahead and left."""
 
     turn: float
     ahead: float
@@ -154,7 +154,7 @@ class _Rule(NamedTuple):
 
 
 class _Near(NamedTuple):
-    """Candidate pairs of a traffic light and a map signal, with their distances.
+    """Pairs of a traffic light and a map signal that may belong together, and their distances.
 
     ``ahead``, ``left``: in the signal's axes, minus the offset of the rule; ``up``: minus the usual height; m.
     """
@@ -204,7 +204,7 @@ def _matched(lights: Floats, signals: Floats) -> dict[int, int]:
 def _near(
     lights: Floats, signals: Floats, rule: _Rule, reach: float, found: Mapping[int, int]
 ) -> _Near:
-    """Return pairs of unassigned traffic lights and map signals with similar heading and small distance."""
+    """Return pairs of unassigned traffic lights and map signals that are near and have similar headings."""
     light = np.setdiff1d(np.arange(len(lights)), list(found))
     signal = np.setdiff1d(np.arange(len(signals)), list(found.values()))
     rows, columns = [light[:0]], [signal[:0]]
@@ -229,7 +229,7 @@ def _near(
 
 
 def _learnt(lights: Floats, signals: Floats, turn: float, found: Mapping[int, int]) -> _Rule | None:
-    """Return the usual offset between traffic lights and map signals. ``None`` means that lights disagree."""
+    """Return the usual offset from map signals to traffic lights; ``None`` if the lights disagree."""
     near = _near(lights, signals, _Rule(turn, 0.0, 0.0), LEARNT_WITHIN, found)
     sure = near.take(_only(near.light) & _only(near.signal))
     if len(sure.light) < LEARNT_FROM:
@@ -270,7 +270,7 @@ def _assigned(near: _Near) -> dict[int, int]:
 
 
 def _heaps(near: _Near) -> Iterator[Rows]:
-    """Yield groups of candidate pairs that have no light and no signal in common with other groups."""
+    """Yield groups of candidate pairs. No light or signal occurs in two groups."""
     if not len(near.light):
         return
     lights = int(near.light.max()) + 1
@@ -292,7 +292,7 @@ def _nearest_in_turn(near: _Near, rows: Rows) -> dict[int, int]:
 
 
 def least_sum(cost: Floats) -> Rows:
-    """Assign a different column to each row of a cost matrix, so that the total cost is minimal.
+    """Assign a different column to each row of a cost matrix. The total cost is the least possible.
 
     Parameters
     ----------
@@ -344,7 +344,7 @@ def least_sum(cost: Floats) -> Rows:
 def _by_boxes(
     lights: Mapping[int, Light], road_map: RoadMap, columns: Iterable[int]
 ) -> dict[int, str]:
-    """Assign the remaining map signals to traffic lights whose trigger boxes lie on the lanes of the signal.
+    """Assign unused map signals to traffic lights whose trigger boxes lie on the lanes of the signal.
 
     Of several signals, the one with the most of these lanes is used, then the nearest. Without a free signal,
     the lanes of the boxes are returned by name.
@@ -388,7 +388,7 @@ def _lanes_after(road_map: RoadMap) -> dict[int, set[int]]:
 
 
 def _lanes_of_boxes(lights: Mapping[int, Light], road_map: RoadMap) -> dict[int, set[int]]:
-    """Return the driving lanes inside the trigger boxes of each traffic light: light id → node ids."""
+    """Return the driving lanes in the trigger boxes of each traffic light: light id → node ids."""
     told = [(ident, box) for ident, light in lights.items() for box in light.boxes]
     boxes = np.array([box for _, box in told], np.float64).reshape(-1, 6)
     hits = road_map.lanes_of(boxes[:, [0, 1, 3, 4, 5]], np.full(len(boxes), np.nan))
@@ -409,7 +409,7 @@ def _through(hits: Any, boxes: Floats) -> Bools:
 
 
 def shared_signals(signals: Mapping[int, str], road_map: RoadMap) -> list[str]:
-    """Return a warning for each map signal that is assigned to several traffic lights."""
+    """Return a warning for each map signal to which several traffic lights are assigned."""
     if len(set(signals.values())) == len(signals):
         return []
     known = set(road_map.nodes.name)
@@ -425,7 +425,7 @@ def shared_signals(signals: Mapping[int, str], road_map: RoadMap) -> list[str]:
 
 
 class AtOnce:
-    """Detector of lanes that have a red and a green light at the same time, because of a wrong assignment.
+    """Detector of wrongly assigned traffic lights: a lane has a red and a green light at the same time.
 
     Parameters
     ----------
@@ -469,7 +469,7 @@ class AtOnce:
         self.frames: dict[str, int] = {} if before is None else before.frames
 
     def see(self, states: Ints) -> None:
-        """Check the traffic light states of a frame for contradictions."""
+        """Check whether the traffic lights of a frame contradict each other."""
         if states is not self._last:
             self._last = states
             self._bad = self._contradicting(states)
@@ -490,7 +490,7 @@ class AtOnce:
 
     @property
     def warnings(self) -> list[str]:
-        """Warnings about lanes with contradictory lights: one for each pair of a red and a green light."""
+        """Warnings about lanes with contradicting lights: one for each pair of a red and a green light."""
         by_lights: dict[tuple[int, int], list[str]] = {}
         for lane, who in sorted(self.who.items()):
             by_lights.setdefault(who, []).append(lane)
@@ -525,7 +525,7 @@ def light_state(number: int) -> str:
 
 
 def read_places(message: dict[str, Any]) -> dict[int, Light]:
-    """Return the traffic lights of a CARLA message, by id. Lights without a valid position are dropped."""
+    """Return the traffic lights in a CARLA message by id. Drop lights without a valid position."""
     lights: dict[int, Light] = {}
     for told in records(message, "traffic_lights"):
         x, y, z = (number(told, f"transform.position.{axis}") for axis in "xyz")
@@ -553,7 +553,7 @@ def heading_of(x: float, y: float, z: float, w: float) -> float:
 
 
 class Lights:
-    """Traffic lights of a CARLA trace, with their latest states.
+    """Traffic lights of a CARLA trace and their latest states.
 
     Parameters
     ----------
@@ -599,11 +599,11 @@ class Lights:
 
     @property
     def warnings(self) -> list[str]:
-        """Warnings so far about traffic lights that may be assigned to a wrong map signal."""
+        """Warnings so far about traffic lights whose map signal may be wrong."""
         return [*self._shared, *self._at_once.warnings]
 
     def of_frame(self) -> Ints:
-        """Return the states of all traffic lights in the next frame, as codes.
+        """Return the states of all traffic lights in the next frame, as state codes.
 
         Frames share this array; do not change it.
         """
@@ -611,7 +611,7 @@ class Lights:
         return self._states
 
     def update(self, message: dict[str, Any]) -> None:
-        """Update the light states from a CARLA message. Lights that are not in the message keep their state."""
+        """Update light states from a CARLA message. Lights that it does not contain keep their state."""
         states = self._states.copy()  # Frames share the old array.
         for told in records(message, "traffic_lights"):
             ident, state = ident_of(told, "id"), ident_of(told, "state")

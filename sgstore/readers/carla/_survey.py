@@ -1,4 +1,4 @@
-"""First pass over a CARLA recording: find actors, channels, egos, traffic lights and the map.
+"""First reading of a CARLA recording: find actors, channels, egos, traffic lights and the map.
 
 The list of actors contains the type of each object. It may occur only once and late, like the positions of
 lights and the map. All of them are collected at the opening of a recording.
@@ -61,7 +61,7 @@ _CLASSES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Actor:
-    """Actor (vehicle, walker, sensor, …) in a CARLA list of actors.
+    """Actor (vehicle, walker, sensor, …) in CARLA's list of actors.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ class Actor:
 
 
 def meaning_of(type_name: str) -> TypeMeaning:
-    """Return kind and subkind of a CARLA blueprint, such as ``vehicle.audi.tt``.
+    """Return kind and subkind for the name of a CARLA blueprint, such as ``vehicle.audi.tt``.
 
     An unmapped vehicle has the general kind ``vehicle``.
     """
@@ -90,7 +90,7 @@ def meaning_of(type_name: str) -> TypeMeaning:
 
 
 def meaning_of_object(actor: Actor | None, classification: float) -> TypeMeaning:
-    """Return kind and subkind of a CARLA object from its blueprint; without one, from its class number.
+    """Return kind and subkind of a CARLA object from its blueprint, or else from its class number.
 
     The class ``car`` is the bridge's default, so it is ignored for an unmapped blueprint.
     """
@@ -105,7 +105,7 @@ def meaning_of_object(actor: Actor | None, classification: float) -> TypeMeaning
 
 @dataclass(slots=True)
 class Egos:
-    """Choice of the ego in a CARLA recording: the requested vehicle, or a vehicle with a usual role name.
+    """Choice of the ego in a CARLA recording: the vehicle that the user names, or one with a usual role name.
 
     Attributes
     ----------
@@ -128,7 +128,7 @@ class Egos:
     later: dict[int, list[Actor]] = field(default_factory=dict[int, list[Actor]])
 
     def id_of(self, role: str) -> int | None:
-        """Return the id of the vehicle with a role name (such as ``hero``), or ``None``."""
+        """Return the id of the vehicle with a role name (such as ``hero``); ``None`` if unknown."""
         ids = self._with(role)
         return ids[0] if ids else self.by_role.get(role)
 
@@ -178,7 +178,7 @@ class Egos:
 
 
 def _listing(egos: Egos) -> str:
-    """Return the vehicles and pedestrians that can be the ego, for an error message."""
+    """Return a text with the vehicles and pedestrians that can be the ego, for an error message."""
     actors = sorted(egos.actors.items(), key=lambda item: (item[1].role == "autopilot", item[0]))
     things = [
         f"{ident} ({actor.role or actor.type_name})"
@@ -239,7 +239,7 @@ _MAX_SECONDS: Final = 1 << 32
 
 
 def content_of(recording: Recording, channel: int) -> str:
-    """Return the content type of a CARLA channel (such as objects or controls); empty if unsupported.
+    """Return the type of content of a CARLA channel (such as objects); empty if it is not supported.
 
     The bridge has no messages for vehicle lights. They are read from JSON messages ``{"t": s, "lights": {id:
     carla.VehicleLightState}}`` of a schema whose name ends in ``VehicleLights``.
@@ -252,7 +252,7 @@ def content_of(recording: Recording, channel: int) -> str:
 
 
 def structure(recording: Recording, channel: int) -> Struct | None:
-    """Return the ROS structure of a channel's messages. ``None`` means another format.
+    """Return the ROS structure of a channel's messages; ``None`` if they have another format.
 
     Raises
     ------
@@ -270,12 +270,12 @@ def role_in(topic: str) -> str:
 
 
 def stamp_of(message: dict[str, Any]) -> int | None:
-    """Return the time stamp in a message header; ns. ``None`` means missing or out of range."""
+    """Return the time stamp in a message header; ns. ``None`` if missing or out of range."""
     return stamp_from([number(message, f"header.stamp.{part}") for part in ("sec", "nanosec")])
 
 
 def stamp_from(told: Floats | list[float]) -> int | None:
-    """Convert seconds and nanoseconds to a time stamp; ns. ``None`` means missing or out of range."""
+    """Convert seconds and nanoseconds to a time stamp; ns. ``None`` if missing or out of range."""
     seconds, nanos = told
     there = abs(seconds) < _MAX_SECONDS and abs(nanos) < _MAX_SECONDS
     return int(seconds) * 1_000_000_000 + int(nanos) if there else None
@@ -292,7 +292,7 @@ _MARKINGS: Final = {0: "other", 1: "broken", 2: "solid"}
 def event_of(
     content: str, message: dict[str, Any], place: tuple[int, int, int], ident: str
 ) -> Event:
-    """Return the event (collision or lane invasion) in a CARLA message.
+    """Return the event (collision or lane invasion) that a CARLA message reports.
 
     ``place``: simulation time, log time, number of the previous frame; ``ident``: id of the vehicle.
     """
@@ -327,7 +327,7 @@ _MOST_NOTES: Final = 100
 
 
 class CarlaSurvey(Survey[Lead]):
-    """First pass over a CARLA recording, which collects the facts that the frames need.
+    """First reading of a CARLA recording. It collects information that the frames need.
 
     Attributes
     ----------
@@ -365,7 +365,7 @@ class CarlaSurvey(Survey[Lead]):
 
     @property
     def driven(self) -> dict[int, str]:
-        """Role name of the vehicle (such as ``hero``) for each channel about a single vehicle."""
+        """Role name (such as ``hero``) of the vehicle of each channel that is about one vehicle."""
         return {
             channel: role_in(self.topic(channel))
             for channel, content in self.contents.items()
@@ -373,7 +373,7 @@ class CarlaSurvey(Survey[Lead]):
         }
 
     def ego_named(self, name: str) -> str | None:
-        """Return the id of the ego for a name. ``None`` means that only a new first pass can find it."""
+        """Return the id of the ego with a name; ``None`` if only another reading of the recording finds it."""
         egos = self.egos
         if name.isdecimal() and int(name) not in egos.actors.keys() | egos.seen:
             return None
@@ -381,36 +381,36 @@ class CarlaSurvey(Survey[Lead]):
         return str(found)
 
     def find_ego(self) -> str:
-        """Find the vehicle with the role name of the ego, and return its id."""
+        """Find the vehicle that has the role name of the ego, and return its id."""
         self.ego, self.about_ego = self.egos.settle(self.driven.values())
         return "" if self.ego is None else str(self.ego)
 
     def role(self, channel: int) -> str:
-        """Return the role of a channel: frames, sensor data, or ``lasting`` facts such as actor lists."""
+        """Return the role of a channel: frames, sensor data, or ``lasting`` for data such as actor lists."""
         lasts = channel != self.leading and self.contents.get(channel) in LASTING
         return "lasting" if lasts else super().role(channel)
 
     def context(self) -> list[Ref]:
-        """Return the file positions of maps, actor lists and calibrations, which later messages need."""
+        """Return the file positions of maps, actor lists and calibrations. Later messages need them."""
         return [*self._lasting, *super().context()]
 
     def meet(self, channel: int) -> bool:
-        """Return True if the messages of a channel are frames, or facts for later frames."""
+        """Return True if the messages of a channel are frames, or contain data for later frames."""
         return self._content(channel) in LASTING | {OBJECTS}
 
     def watches(self, channel: int, *, met: bool) -> bool:
-        """Return True if the first pass must examine the messages of a channel."""
+        """Return True if the first reading must examine the messages of a channel."""
         content = self.contents[channel]
         if content == TEXT:
             return channel not in self._last  # A text other than a map is examined only once.
         return met or (content == ODOMETRY and self._is_lost(channel))
 
     def keeps(self, channel: int) -> bool:
-        """Return True if the second pass, which builds the frames, needs the messages of a channel."""
+        """Return True if messages of a channel are needed in the second reading, which makes the frames."""
         return self._content(channel) in FOR_FRAMES
 
     def _content(self, channel: int) -> str:
-        """Return the content type of a CARLA channel, such as objects. Empty if the channel is not needed."""
+        """Return the type of content of a CARLA channel, such as objects; empty if it is not needed."""
         if channel not in self.contents:
             self.contents[channel] = content = content_of(self.recording, channel)
             try:
@@ -436,7 +436,7 @@ class CarlaSurvey(Survey[Lead]):
             self.leads[channel] = Lead(stamps=stamps)
 
     def look(self, run: Messages, row: int) -> None:
-        """Collect facts from one CARLA message. Unreadable messages are counted."""
+        """Collect information from a CARLA message. Unreadable messages are counted."""
         channel = int(run.channel[row])
         if self.contents[channel] in {TEXT, ODOMETRY} and not self.watches(channel, met=False):
             return
@@ -469,7 +469,7 @@ class CarlaSurvey(Survey[Lead]):
 
     @property
     def _take(self) -> dict[str, Callable[[dict[str, Any]], bool]]:
-        """Functions by content type that collect facts from a message. They return True if a fact is new."""
+        """Functions that collect information from messages, by content type. They return True if it is new."""
         return {
             ACTORS: self._take_actors,
             LIGHT_PLACES: self._take_lights,
@@ -493,7 +493,7 @@ class CarlaSurvey(Survey[Lead]):
         return "<OpenDRIVE" in told[:_MAP_BEGINS] and self._take_map(told, "")
 
     def _take_actors(self, message: dict[str, Any]) -> bool:
-        """Add a CARLA list of actors to the known facts. Return True if an actor is new."""
+        """Add the actors in a CARLA message to the known ones. Return True if one is new."""
         actors = self.egos.actors
         known = len(actors)
         for told in records(message, "actors"):
@@ -522,13 +522,13 @@ class CarlaSurvey(Survey[Lead]):
         return True
 
     def _note(self, note: str) -> None:
-        """Add a warning to the report, unless it is a duplicate or one too many."""
+        """Add a warning to the report once. The number of warnings is limited."""
         if note not in self.notes and len(self.notes) <= _MOST_NOTES:
             more = "and more that is as odd"
             self.notes.append(note if len(self.notes) < _MOST_NOTES else more)
 
     def _is_lost(self, channel: int) -> bool:
-        """Return True if the vehicle of an odometry channel (own position of a vehicle) is not known yet."""
+        """Return True if a channel has the odometry of a vehicle that is not known yet."""
         role = role_in(self.topic(channel))
         tried = self._tries >= _MOST_TRIES
         return bool(role) and not tried and self.egos.id_of(role) is None
@@ -545,7 +545,7 @@ class CarlaSurvey(Survey[Lead]):
             self._find_egos()
 
     def _find_egos(self) -> None:
-        """Find the vehicle of each role name: the only object at the position that its odometry reports."""
+        """Find the vehicle of each role name: the only object at the position in its odometry."""
         stamp, table = self._objects
         self._tries += 1
         for role, (when, place) in self._odometry.items():

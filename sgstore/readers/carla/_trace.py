@@ -109,7 +109,7 @@ Controls = tuple[float, ...]
 
 @dataclass(slots=True)
 class CarlaRawFrame:
-    """Frame of a CARLA recording with the original numbers, before conversion.
+    """Frame of a CARLA recording before conversion, with its original numbers.
 
     Attributes
     ----------
@@ -187,7 +187,7 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
         self._lights = Lights(survey.lights, signals, road_map, self.roster)
 
     def decode(self, run: Messages, row: int) -> CarlaRawFrame | None:
-        """Return the raw frame of a CARLA message. ``None`` means not a frame, or unreadable."""
+        """Return the frame in a CARLA message, before conversion; ``None`` if not a frame, or unreadable."""
         channel, log_time = int(run.channel[row]), int(run.log_time_ns[row])
         if channel in self._leading:
             self._stamps.next()
@@ -255,7 +255,7 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
         return frame
 
     def _add_controls(self, frame: CarlaRawFrame) -> None:
-        """Add the latest controls to a frame, if they are still valid."""
+        """Add the latest controls of vehicles to a frame, if they are recent enough."""
         for ident, (stamp, controls) in self._controls.items():
             if -SAME_TICK <= frame.time_ns - stamp <= HOLDS:
                 frame.controls[ident] = controls
@@ -278,7 +278,7 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
             self._people.add(node)
 
     def _other(self, ident: int, classification: float) -> dict[int, Called]:
-        """Return the kind of an object whose class is not its first class: node id → kind. Otherwise empty."""
+        """Return the present kind of an object if its class has changed: node id → kind; otherwise empty."""
         node = self._nodes[ident]
         if np.isnan(self._classes[ident]):
             self._classes[ident] = classification
@@ -294,7 +294,7 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
         return {} if vague or meaning.kind == first else {node: (meaning, type_name)}
 
     def complete(self, frames: list[CarlaRawFrame]) -> list[FrameRows]:
-        """Convert raw CARLA frames to frames with poses, speeds and sizes, many frames at once."""
+        """Convert CARLA frames: compute poses, speeds and sizes of many frames at once."""
         if not frames:
             return []
         nodes = np.concatenate([frame.nodes for frame in frames])
@@ -314,7 +314,7 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
         return done
 
     def _rows(self, frame: CarlaRawFrame, values: Floats, usable: Bools) -> FrameRows:
-        """Convert a raw CARLA frame into its final columns, without unusable rows."""
+        """Convert a CARLA frame to the columns of a decoded frame. Drop unusable rows."""
         node = frame.nodes
         if not usable.all():
             for row in np.flatnonzero(~usable).tolist():
@@ -348,7 +348,7 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
         return rows.with_heads((self._lights.nodes, self._lights.values, frame.light_states))
 
     def _own_of(self, frame: CarlaRawFrame, ego: int) -> dict[int, dict[str, Any]]:
-        """Return the attributes without a column, of the ego and of vehicles with controls, by node id."""
+        """Return attributes without a column, for the ego and vehicles with controls: node id → attributes."""
         found = {self._nodes.get(ident, -1): own for ident, own in frame.own.items()}
         for node in {ego, *found} - {-1}:
             rows = np.flatnonzero(frame.nodes == node)
@@ -372,7 +372,7 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
         self._unusable.add(reason.format(self._idents[node]), frame.log_time_ns)
 
     def _takers(self) -> dict[int, Callable[[int, int, memoryview], None]]:
-        """Return the function that processes messages, for each channel other than the frame channel."""
+        """Return the function that processes the messages of each channel, except the frame channel."""
         found = self._survey
         takers: dict[int, Callable[[int, int, memoryview], None]] = {}
         own = {
@@ -447,7 +447,7 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
         self._see_odometry()
 
     def _see_odometry(self) -> None:
-        """Use the ego's odometry for a frame in which the ego is not among the objects."""
+        """If the ego is not among the objects of a frame, add it from its odometry."""
         frame, (stamp, numbers), ego = self._frame, self._odometry, self._ego
         if frame is None or numbers is None or ego is None:
             return
@@ -511,7 +511,7 @@ def _turned(quaternions: Floats) -> tuple[Floats, Floats]:
 
 
 def _boxes(shape: Floats, size: Floats) -> Floats:
-    """Return length, width and height of the shapes of objects. Round shapes have a radius instead."""
+    """Return length, width and height of objects from their shapes. Round shapes have a radius instead."""
     boxes = size.copy()
     sphere = shape == _SPHERE
     boxes[sphere] = 2 * size[sphere, :1]
@@ -521,7 +521,7 @@ def _boxes(shape: Floats, size: Floats) -> Floats:
 
 
 def _pose_of(odometry: Floats) -> Floats:
-    """Return pose columns from an odometry message. They describe the origin of the vehicle, not its centre."""
+    """Return pose columns from odometry. The position is the origin of the vehicle, not its centre."""
     values = np.full(len(POSE), np.nan)
     angles, _ = _turned(odometry[None, 3:7])
     values[:3], values[3:6] = odometry[:3], angles[0]
@@ -536,7 +536,7 @@ def _pose_of(odometry: Floats) -> Floats:
 
 
 def _vehicle_lights(data: memoryview) -> tuple[int, dict[int, int]]:
-    """Return the time stamp of a JSON message, and the light states of vehicles by id.
+    """Return the time stamp of a JSON message, and the states of vehicle lights by vehicle id.
 
     Raises
     ------
@@ -608,13 +608,13 @@ class CarlaTrace(SurveyedTrace[CarlaSurvey]):
         return CarlaDecoder(self._survey, self._signals, self._road_map, report)
 
     def on_map(self, road_map: RoadMap | None) -> None:
-        """Find the lanes of the traffic lights in the road map."""
+        """Find the map signals or lanes of the traffic lights in the road map."""
         if self._survey.lights and road_map is not None:
             self._road_map = road_map
             self._signals = signals_of(self._survey.lights, road_map)
 
     def _own_map(self) -> RoadMap | None:
-        """Return the road map in the recording, if traffic lights must be located on it."""
+        """Return the road map in the recording if traffic lights need it; otherwise ``None``."""
         if not (self._survey.lights and self._survey.map_text):
             return None
         try:
@@ -624,7 +624,7 @@ class CarlaTrace(SurveyedTrace[CarlaSurvey]):
 
 
 def _own_inputs(told: Sequence[float], *, applied: bool) -> dict[str, Any]:
-    """Return user-defined attributes from CARLA's vehicle controls, such as the gear.
+    """Return custom attributes from CARLA's vehicle controls, such as the gear.
 
     Of an applied control, only the mode of the gear has no column. A requested control has none at all.
     """

@@ -43,7 +43,7 @@ Place = tuple[float, float, float]
 
 
 class State(NamedTuple):
-    """State of a CommonRoad obstacle at a time step: position, heading, speed, …; NaN means unknown.
+    """State of a CommonRoad obstacle at a time step: position, heading, speed, …; NaN if unknown.
 
     The units are m, rad, m/s, m/s² and rad/s.
     """
@@ -70,7 +70,7 @@ class ObstacleBox(NamedTuple):
 
 @dataclass(slots=True)
 class Obstacle:
-    """Obstacle (vehicle, pedestrian, …) of a CommonRoad scenario, with its states by time step."""
+    """Obstacle (vehicle, pedestrian, …) of a CommonRoad scenario. It has a state for each time step."""
 
     ident: str
     type: str
@@ -82,7 +82,7 @@ class Obstacle:
 
 @dataclass(frozen=True, slots=True)
 class ScenarioLight:
-    """Traffic light of a CommonRoad scenario, with its cycle: (number of steps, state)."""
+    """Traffic light of a CommonRoad scenario. Its cycle is a list of (number of steps, state)."""
 
     ident: str
     place: Place | None
@@ -107,7 +107,7 @@ class ScenarioLight:
 
 @dataclass(frozen=True, slots=True)
 class ScenarioSign:
-    """Traffic sign of a CommonRoad scenario, with its plates: (code, value)."""
+    """Traffic sign of a CommonRoad scenario. Each of its plates is a pair (code, value)."""
 
     ident: str
     place: Place | None
@@ -173,7 +173,7 @@ class TrafficScenario:
     states: int = 0
 
     def lose(self, what: str) -> None:
-        """Record an unreadable part of the scenario, for the report."""
+        """Record that a part of the scenario is unreadable, for the report."""
         if len(self.lost) < MAX_LOST:
             self.lost.append(what)
         else:
@@ -215,7 +215,7 @@ class _Node:
         return [child for child in self.children if child.tag == tag]
 
     def get(self, *path: str) -> _Node | None:
-        """Return the first XML element at a path of tags, or ``None``."""
+        """Return the first XML element at a path of tags; ``None`` if it does not exist."""
         found: _Node | None = self
         for tag in path:
             found = next((child for child in found.children if child.tag == tag), None)
@@ -346,7 +346,7 @@ def _point(node: _Node) -> Place:
 
 
 def _position(node: _Node | None) -> Place | None:
-    """Return the position in an XML element, or the centre of its area. ``None`` means missing."""
+    """Return the position in an XML element, or the centre of its area; ``None`` if it has neither."""
     if node is None or not node.children:
         return None
     point = node.get("point")
@@ -357,7 +357,7 @@ def _position(node: _Node | None) -> Place | None:
 
 
 def _corners(shapes: _Node) -> Iterator[tuple[float, float]]:
-    """Yield points whose bounding box contains all shapes in an XML element."""
+    """Yield points around all shapes in an XML element. The box around the points contains the shapes."""
     for shape in shapes.children:
         if shape.tag == "polygon":
             yield from (_point(point)[:2] for point in shape.all("point"))
@@ -423,7 +423,7 @@ _LIGHTS: Final = {
 
 
 def _state(node: _Node) -> State | None:
-    """Read the state of an obstacle from XML. ``None`` means that it has no position."""
+    """Read the state of an obstacle from XML; ``None`` if it has no position."""
     place = _position(node.get("position"))
     if place is None:
         return None
@@ -499,7 +499,7 @@ def _signal(node: _Node, found: Obstacle) -> None:
 
 
 def _surroundings(scenario: TrafficScenario, node: _Node) -> None:
-    """Add an obstacle of the environment (such as a building), which has only a shape in map axes."""
+    """Add an obstacle of the environment (such as a building). It has only a shape, in map axes."""
     ident = _ident(node)
     if ident in scenario.obstacles:
         raise ValueError("there are two of this id; the first one counts")

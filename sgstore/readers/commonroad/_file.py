@@ -1,4 +1,4 @@
-"""CommonRoad scenarios with the interface of an MCAP file: one map message, and one message per time step.
+"""CommonRoad scenarios, read like MCAP files: a map message, and a message per time step.
 
 A scenario contains each obstacle with all of its states. The file is therefore read as a whole at the first
 access. Its messages are JSON and always the same. The first one is the road map as a text of lanes; each
@@ -45,7 +45,7 @@ def is_scenario(path: Path) -> bool:
 
 
 class CommonRoadFile(NumberedFile):
-    """CommonRoad scenario with the interface of an MCAP file (log of messages).
+    """CommonRoad scenario that can be read like an MCAP file (log of messages).
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ class CommonRoadFile(NumberedFile):
             self.losses.append(f"{self._scenario.more_lost} more of the same kinds")
 
     def message(self, number: int) -> bytes:
-        """Return the bytes of a message by number: 0 is the map, 1 and higher are the time steps.
+        """Return the bytes of the message with a number: 0 is the map, the others are time steps.
 
         Raises
         ------
@@ -106,7 +106,7 @@ class CommonRoadFile(NumberedFile):
         return _step_message(self._scenario, self._steps[number - 1], standing)
 
     def time_of(self, number: int) -> int:
-        """Return the time of a step by number, from 1; ns."""
+        """Return the time of the step with a number, from 1; ns."""
         return round(self._steps[number - 1] * self._scenario.step * 1e9)
 
 

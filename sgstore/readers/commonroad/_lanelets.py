@@ -82,7 +82,7 @@ _CODES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class SignMeaning:
-    """Kind of a traffic sign, a short text, and the speed limit of a speed limit sign; m/s."""
+    """Meaning of a traffic sign: its kind, a short text, and the limit of a speed limit sign (m/s)."""
 
     kind: str
     subkind: str
@@ -90,7 +90,7 @@ class SignMeaning:
 
 
 def meaning_of(sign: ScenarioSign) -> SignMeaning:
-    """Return the meaning of a traffic sign: that of its first known plate, otherwise a text of its codes."""
+    """Return the meaning of a traffic sign: that of its first known plate, or else a text with its codes."""
     for code, value in sign.plates:
         kind = _CODES.get(code)
         if kind == "speed_limit" and 0 < value < 200:
@@ -104,7 +104,7 @@ def meaning_of(sign: ScenarioSign) -> SignMeaning:
 
 
 def light_place(scenario: TrafficScenario, light: ScenarioLight) -> Place | None:
-    """Return the position of a traffic light; by default, the right end of its first lanelet."""
+    """Return the position of a traffic light. By default, it is the right end of its first lanelet."""
     if light.place is not None:
         return light.place
     lanes = (one for one in scenario.lanelets.values() if light.ident in one.lights)
@@ -158,7 +158,7 @@ def map_text(scenario: TrafficScenario) -> str:
 
 
 def _contradictions(scenario: TrafficScenario) -> Iterator[str]:
-    """Yield texts about references to missing parts, and about neighbours in the wrong direction."""
+    """Yield warnings about references to missing parts, and neighbours with a wrong direction."""
     used: set[str] = set()
     for lanelet in scenario.lanelets.values():
         used |= {*lanelet.lights}
@@ -196,7 +196,7 @@ def _way(lanelet: Lanelet) -> Floats:
 
 
 def _evened(left: Floats, right: Floats) -> tuple[Floats, Floats]:
-    """Return both borders of a lanelet with the same number of points, at even distances."""
+    """Return both borders of a lanelet with points at equal distances, and equally many of them."""
     count = max(len(left), len(right))
     shares = np.linspace(0.0, 1.0, count)
 
@@ -231,7 +231,7 @@ def _line(scenario: TrafficScenario, lanelet: Lanelet, left: Floats, right: Floa
 
 
 def _lane_type(lanelet: Lanelet) -> str:
-    """Return the lane type of a lanelet, from its own types, else from its permitted users."""
+    """Return the lane type of a lanelet, from its own types or else from its permitted users."""
     for word in lanelet.types:
         if word in _TYPES:
             return _TYPES[word]
@@ -242,7 +242,7 @@ def _lane_type(lanelet: Lanelet) -> str:
 
 
 def _limit(scenario: TrafficScenario, lanelet: Lanelet) -> float:
-    """Return the lowest speed limit of a lanelet; m/s; NaN without a limit."""
+    """Return the lowest speed limit of a lanelet; m/s. NaN without a limit."""
     signs = (scenario.signs[name] for name in lanelet.signs if name in scenario.signs)
     limits = [lanelet.speed_limit, *(meaning_of(sign).limit for sign in signs)]
     return min((one for one in limits if 0 < one < 1000), default=math.nan)
@@ -251,7 +251,7 @@ def _limit(scenario: TrafficScenario, lanelet: Lanelet) -> float:
 def _signals(
     scenario: TrafficScenario, lanes: Sequence[PlainLane], notes: list[str]
 ) -> Iterator[PlainSignal]:
-    """Yield the traffic signs and lights of the lanes that refer to them, and the stop lines."""
+    """Yield the signs and lights to which lanes refer, and the stop lines."""
     row_of = {lane.name: row for row, lane in enumerate(lanes)}
     stops = _stops(scenario, lanes, row_of, notes)
     users: dict[str, list[int]] = {}

@@ -48,11 +48,11 @@ class CommonRoadTrace(FramesTrace):
 
     @staticmethod
     def role(channel: Channel) -> str:
-        """Return the role of a channel: ``ground_truth`` for time steps, ``map``, else ``payload``."""
+        """Return the role of a channel: ``ground_truth`` for time steps, ``map``, or otherwise ``payload``."""
         return {STEP: "ground_truth", MAP: "map"}.get(channel.schema, "payload")
 
     def frame(self, message: TraceMessage) -> Frame:
-        """Return the frame of a time step. It has no ego, because scenarios do not define an ego."""
+        """Return the frame of a time step. It has no ego, because scenarios have none."""
         told = json.loads(message.data)
         frame = Frame(round(told["time"] * 1e9))
         for one in told["obstacles"]:

@@ -1,4 +1,4 @@
-"""Reader of mapping files for Foxglove scenes. A mapping names the fields for kind, id, speed and ego.
+"""Mapping files for Foxglove scenes. A mapping names the fields with kind, id, speed and ego.
 
 A ``foxglove.SceneUpdate`` is made for drawing. Its boxes lack types, speeds and the ego. Every producer stores
 these facts in its own way, so a mapping describes them. ``docs/source_foxglove.md`` explains the file. The
@@ -41,14 +41,14 @@ METADATA: Final = "metadata."
 
 @dataclass(frozen=True, slots=True)
 class Recognise:
-    """Condition of a mapping shipped with sgstore: topics that the recording must have."""
+    """Condition for the use of a mapping that sgstore includes: topics that the recording must have."""
 
     topics: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class SceneMapping:
-    """Topics of the messages that form the scene, in a mapping file for Foxglove scenes.
+    """Part of a mapping file for Foxglove scenes: the topics with the messages of the scene.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class SceneMapping:
 
 @dataclass(frozen=True, slots=True)
 class EntityMapping:
-    """Names of the message fields with an object's id, type, speed and so on; empty for an unused value.
+    """Names of the message fields with id, type, speed and so on of an object. A value without field is empty.
 
     Attributes
     ----------
@@ -91,11 +91,11 @@ class EntityMapping:
     light_state: str = ""
 
     def ident_of(self, box: Box) -> str:
-        """Return the id of an object from its mapped field; without one, the id in the scene message."""
+        """Return the id of an object from its mapped field, or else its id in the scene message."""
         return _text(self.id, box) or box.id
 
     def type_of(self, box: Box) -> str:
-        """Return the type name of an object from its mapped field, or an empty string."""
+        """Return the type name of an object from its mapped field, or an empty text."""
         if self.type:
             told = _text(self.type, box)
             if told or self.type != "metadata.type":
@@ -117,7 +117,7 @@ class EntityMapping:
 
 @dataclass(frozen=True, slots=True)
 class Ego:
-    """Choice of the ego in a mapping file: a scene object, or moving coordinate axes with a box.
+    """Part of a mapping file that defines the ego: a scene object, or moving coordinate axes with a box.
 
     Attributes
     ----------
@@ -162,7 +162,7 @@ class Mapping:
     types: Map[str, TypeMeaning] = field(default_factory=dict[str, TypeMeaning])
 
     def meaning(self, type_name: str) -> TypeMeaning:
-        """Return the kind for the type name of an object. Unmapped types are ``unknown`` or ``vehicle``."""
+        """Return the kind for an object's type name. Types without mapping are ``unknown`` or ``vehicle``."""
         name = type_name.lower()
         if name in self.types:
             return self.types[name]
@@ -209,7 +209,7 @@ def shipped() -> Map[str, Mapping]:
 
 
 def mapping_for(given: str | Path, topics: Iterable[str]) -> Mapping:
-    """Return the requested mapping, or the included mapping that fits the topics of a recording.
+    """Return the mapping that the user names, or else the included mapping that fits the recording's topics.
 
     Parameters
     ----------

@@ -76,7 +76,7 @@ class Axes:
     _tracks: dict[str, _Track] = field(default_factory=dict[str, _Track])
 
     def tell(self, child: str, parent: str, time_ns: int, pose: Pose) -> bool:
-        """Add the pose of coordinate axes in parent axes. Return False if the pose is rejected."""
+        """Add the pose of coordinate axes relative to their parent. Return False if it is not accepted."""
         track = self._tracks.get(child)
         if track is None:
             if len(self._tracks) >= MAX_AXES or child == parent:
@@ -96,7 +96,7 @@ class Axes:
         return True
 
     def pose(self, axes: str, root: str, time_ns: int) -> Pose | None:
-        """Return the pose of coordinate axes in other axes at a time, or ``None`` without a connection."""
+        """Return the pose of coordinate axes relative to others at a time; ``None`` if not connected."""
         place, turn = ORIGIN, STILL
         for _ in range(MAX_DEPTH):
             if axes == root:
@@ -111,12 +111,12 @@ class Axes:
         return None
 
     def root(self) -> str:
-        """Return the name of the only coordinate axes without parent axes; otherwise an empty text."""
+        """Return the coordinate axes without parent, if only one has none; otherwise an empty text."""
         roots = set(self.parents.values()) - set(self.parents)
         return roots.pop() if len(roots) == 1 else ""
 
     def forget(self, before_ns: int) -> None:
-        """Delete the old poses that times from ``before_ns`` on do not need."""
+        """Delete old poses that are not needed for times from ``before_ns`` on."""
         for track in self._tracks.values():
             keep = bisect_right(track.times, before_ns) - 1
             if keep > 0:
@@ -133,7 +133,7 @@ def normed(turn: Floats) -> Floats:
 
 
 def product(a: Floats, b: Floats) -> Floats:
-    """Multiply two quaternions: the result is the rotation b followed by the rotation a."""
+    """Multiply two quaternions. The result is rotation b followed by rotation a."""
     ax, ay, az, aw = a.tolist()
     bx, by, bz, bw = b.tolist()
     return np.array(
@@ -211,7 +211,7 @@ _DELETE_ALL: Final = 1
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """Object of a Foxglove scene that has a body: id, pose, size and metadata.
+    """Object of a Foxglove scene with a body: its id, pose, size and metadata.
 
     Attributes
     ----------
@@ -242,7 +242,7 @@ class Box:
 
 @dataclass(frozen=True, slots=True)
 class Deletion:
-    """Part of a Foxglove message that deletes objects older than a given time: one object, or all.
+    """Deletion in a Foxglove message: of one object or all, if older than a time.
 
     ``time_ns`` is ``None`` for a deletion without a time, which applies to any age.
     """
@@ -253,7 +253,7 @@ class Deletion:
 
 @dataclass(frozen=True, slots=True)
 class SceneUpdate:
-    """Foxglove message with new and deleted objects of a scene.
+    """Foxglove message that adds objects to a scene and deletes others.
 
     ``bodiless``: number of entities with only lines, texts or arrows.
     """
@@ -265,7 +265,7 @@ class SceneUpdate:
 
 @dataclass(frozen=True, slots=True)
 class Transform:
-    """Pose of coordinate axes relative to their parent axes, from a Foxglove message."""
+    """Pose of coordinate axes relative to their parent, from a Foxglove message."""
 
     parent: str
     child: str
@@ -278,7 +278,7 @@ DERIVED: Final = {"sgstore": "derived"}
 
 
 def encoding_of(recording: Recording, channel: int) -> str:
-    """Return ``protobuf`` or ``json`` for a channel with Foxglove messages, else an empty string."""
+    """Return ``protobuf`` or ``json`` for a channel with Foxglove messages, otherwise an empty text."""
     record = recording.channels[channel]
     if DERIVED.items() <= record.metadata.items():
         return ""
@@ -309,7 +309,7 @@ class ChannelReader:
         self._class = message_class(schema, fields) if encoding == "protobuf" else None
 
     def scene(self, data: bytes) -> SceneUpdate:
-        """Decode a Foxglove message with new and deleted objects of a scene.
+        """Decode a Foxglove message that adds and deletes objects of a scene.
 
         Raises
         ------
@@ -362,7 +362,7 @@ class ChannelReader:
 
 
 def _get(part: Any, name: str, otherwise: Any) -> Any:
-    """Return a field of a protobuf message or JSON object, or a default value for a missing field."""
+    """Return a field of a protobuf message or JSON object, or ``default`` if it is missing."""
     if isinstance(part, dict):
         return part.get(name, otherwise)
     if part is None:
@@ -403,7 +403,7 @@ def _box(entity: Any) -> Box | None:
 
 
 def _body(entity: Any) -> tuple[Pose | None, tuple[float, float, float]] | None:
-    """Return pose and size of a scene object: of its largest box, or of another solid or model."""
+    """Return pose and size of a scene object: those of its largest box, or else of another solid or model."""
     for name in ("cubes", "cylinders", "spheres"):
         solids = _list(entity, name)
         if solids:

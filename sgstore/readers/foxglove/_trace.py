@@ -1,4 +1,4 @@
-"""Reader of Foxglove scenes: messages ``SceneUpdate`` and ``FrameTransform`` (protobuf or JSON) in MCAP.
+"""Reader of Foxglove scenes in MCAP files: messages ``SceneUpdate`` and ``FrameTransform``.
 
 A recording is recognised by the schemas of its channels. A scene is made for drawing. A mapping therefore
 defines the types and speeds of its boxes, and the ego (:mod:`sgstore.readers.foxglove._mapping`). A frame is
@@ -78,7 +78,7 @@ _HEADING, _VELOCITY, _ACCELERATION, _SIZE = 3, 6, 9, 13
 
 
 class FoxgloveSurvey(Survey[Lead]):
-    """First pass over a Foxglove recording, which collects the facts that the frames need.
+    """First reading of a Foxglove recording. It collects information that the frames need.
 
     The weight of a frame is 1 if it has boxes.
 
@@ -103,7 +103,7 @@ class FoxgloveSurvey(Survey[Lead]):
         self._axes = Axes()
 
     def root(self) -> str:
-        """Return the name of the fixed coordinate axes of the scene."""
+        """Return the name of the coordinate axes in which the scene is fixed."""
         if self.mapping.scene.axes:
             return self.mapping.scene.axes
         most = [axes for axes, _ in self._entity_axes.most_common(1)]
@@ -116,7 +116,7 @@ class FoxgloveSurvey(Survey[Lead]):
         return f"no {SCENE} can be read{where}"
 
     def find_ego(self) -> str:
-        """Find the scene object or coordinate axes of the ego, and return the name."""
+        """Find the scene object or coordinate axes of the ego, and return its name."""
         self.ego = self._named(self.wanted) if self.wanted else self._meant()
         return self.ego[0] or self.ego[1]
 
@@ -152,7 +152,7 @@ class FoxgloveSurvey(Survey[Lead]):
         return "", axes
 
     def context(self) -> list[Ref]:
-        """Return the positions of messages with objects that stay valid, because later messages need them."""
+        """Return positions of messages with objects or transforms that stay valid. Later messages need them."""
         lasting = self._transforms
         if not self.mapping.scene.snapshot:
             lasting = self._entities | self._transforms
@@ -160,11 +160,11 @@ class FoxgloveSurvey(Survey[Lead]):
         return [*self.once(first), *(ref for count, ref in lasting.values() if count == 1)]
 
     def keeps(self, channel: int) -> bool:
-        """Return True if the second pass, which builds the frames, needs the messages of a channel."""
+        """Return True if messages of a channel are needed in the second reading, which makes the frames."""
         return bool(encoding_of(self.recording, channel))
 
     def meet(self, channel: int) -> bool:
-        """Return True if the reader needs the messages of a channel. A new channel gets a decoder."""
+        """Return True if the reader needs the messages of a channel. If so, prepare their decoder."""
         if channel in self.readers:
             return True
         encoding = encoding_of(self.recording, channel)
@@ -181,7 +181,7 @@ class FoxgloveSurvey(Survey[Lead]):
         return True
 
     def look(self, run: Messages, row: int) -> None:
-        """Collect facts from one Foxglove message: scene objects or coordinate axes."""
+        """Collect information from a Foxglove message with scene objects or coordinate axes."""
         channel = int(run.channel[row])
         reader = self.readers[channel]
         if reader.name == SCENE:
@@ -207,14 +207,14 @@ class FoxgloveSurvey(Survey[Lead]):
 
 
 def time_of(scene: SceneUpdate) -> int | None:
-    """Return the time of a Foxglove scene message: the time of its newest object. ``None`` without a time."""
+    """Return the time of a scene message: that of its newest object. ``None`` if no object has a time."""
     times = [box.time_ns for box in scene.boxes if box.time_ns is not None]
     return max((one for one in times if abs(one) < LATEST_NS), default=max(times, default=None))
 
 
 @dataclass(slots=True)
 class FoxgloveRawFrame:
-    """Frame of a Foxglove recording before conversion, with poses in their original axes.
+    """Frame of a Foxglove recording before conversion. Its poses have their original coordinate axes.
 
     ``boxes``: each with its node id and the log time of its message. ``kinds``: as in
     :class:`~sgstore.readers._blocks.FrameRows`.
@@ -255,7 +255,7 @@ class FoxgloveDecoder(SurveyedDecoder[FoxgloveRawFrame, FoxgloveSurvey]):
         self._bodiless = self._odd_axes = 0
 
     def decode(self, run: Messages, row: int) -> FoxgloveRawFrame | None:
-        """Return the raw frame of a Foxglove message; ``None`` for messages other than the main scene."""
+        """Return the frame that a Foxglove message starts, before conversion; ``None`` for other messages."""
         channel, log_time = int(run.channel[row]), int(run.log_time_ns[row])
         reader = self._readers[channel]
         if channel in self._leading:
@@ -314,7 +314,7 @@ class FoxgloveDecoder(SurveyedDecoder[FoxgloveRawFrame, FoxgloveSurvey]):
             frame.kinds = {node: told for node, told in self._kinds.items() if node in here}
 
     def complete(self, frames: list[FoxgloveRawFrame]) -> list[FrameRows]:
-        """Convert raw Foxglove frames to frames with the poses of boxes in fixed map axes."""
+        """Convert Foxglove frames: compute the poses of boxes in fixed map axes."""
         done = [self._rows(frame) for frame in frames]
         if frames:
             self._axes.forget(frames[-1].time_ns - REMEMBERED)
@@ -348,7 +348,7 @@ class FoxgloveDecoder(SurveyedDecoder[FoxgloveRawFrame, FoxgloveSurvey]):
     def _take_scene(
         self, channel: int, scene: SceneUpdate, time_ns: int, log_time: int, *, goes_on: bool
     ) -> None:
-        """Add, change and delete the current scene objects according to a scene message.
+        """Add, change and delete scene objects as a scene message requests.
 
         With ``goes_on``, the message adds to a message of another channel.
         """
@@ -379,14 +379,14 @@ class FoxgloveDecoder(SurveyedDecoder[FoxgloveRawFrame, FoxgloveSurvey]):
             standing[ident] = (told, box)
 
     def _delete(self, standing: dict[str, tuple[int, Box]], gone: Deletion, log_time: int) -> None:
-        """Delete the scene objects that a deletion message refers to: the older ones."""
+        """Delete the scene objects that a deletion names: one or all, if older than its time."""
         before = None if gone.time_ns is None else self._stamps.beside(log_time, gone.time_ns)
         for ident in [*standing] if gone.id is None else [gone.id]:
             if ident in standing and (before is None or standing[ident][0] < before):
                 del standing[ident]
 
     def _see_kind(self, node: int, box: Box) -> None:
-        """Record the current type of a scene object if its kind differs from its first kind."""
+        """If the kind of a scene object differs from its first kind, record its present type."""
         first, type_name = self.roster.entered(node), self._mapping.entity.type_of(box)
         self._kinds.pop(node, None)
         if type_name != first.type_name:
@@ -446,7 +446,7 @@ class FoxgloveDecoder(SurveyedDecoder[FoxgloveRawFrame, FoxgloveSurvey]):
         )
 
     def _values(self, box: Box, time_ns: int) -> list[float] | None:
-        """Return the pose columns of a scene object; ``None`` without a pose in fixed map axes."""
+        """Return the pose columns of a scene object; ``None`` if its pose in fixed map axes is unknown."""
         at = time_ns if box.locked or box.time_ns is None else box.time_ns
         outer = self._axes.pose(box.axes or self._root, self._root, at)
         if box.pose is None or outer is None:

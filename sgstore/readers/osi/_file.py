@@ -1,4 +1,4 @@
-"""Reader of OSI files with one channel (``.osi``, ``.osi.zst``), which are plain sequences of messages.
+"""Reader of OSI files with one channel (``.osi``, ``.osi.zst``): plain sequences of messages.
 
 A compressed file is decompressed block by block. A zstd block has at most 128 KiB, so memory stays small for
 any file. The total decompressed size is limited, too.
@@ -78,7 +78,7 @@ def is_compressed(file: BinaryIO) -> bool:
 
 
 def pieces(file: BinaryIO, start: int = -1) -> Iterator[tuple[int, bytes]]:
-    """Yield the decompressed content of a file in pieces, each with the offset of its zstd frame.
+    """Yield the decompressed content of a file in pieces, and the offset of the zstd frame of each.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def _frame(file: BinaryIO, place: int) -> Iterator[bytes]:
 
 
 def read_messages(path: Path, places: Iterable[tuple[int, int, int]]) -> Iterator[bytes]:
-    """Yield the raw bytes of messages of an OSI file, from their positions.
+    """Yield the bytes of messages in an OSI file, given by their positions.
 
     Parameters
     ----------
@@ -186,7 +186,7 @@ def _message_at(path: Path, chunk_offset: int, offset: int, length: int) -> byte
 
 
 def _cut(content: Iterator[tuple[int, bytes]], offset: int, length: int) -> bytes:
-    """Return ``length`` bytes from ``offset`` on. The content of the file arrives in pieces."""
+    """Return ``length`` bytes of a file from ``offset`` on. The content is given in pieces."""
     found = bytearray()
     position = 0
     for _, piece in content:
@@ -219,7 +219,7 @@ _VERSION, _TIMESTAMP = 1, 2
 
 
 class OsiFile(MessageFile):
-    """OSI file with one channel, with the interface of an MCAP file (log of messages).
+    """OSI file with one channel that can be read like an MCAP file (log of messages).
 
     Parameters
     ----------
@@ -301,7 +301,7 @@ class OsiFile(MessageFile):
         raise TraceError(reason, path=self.path)
 
     def _messages(self, report: Findings) -> Iterator[tuple[int, int, bytes]]:
-        """Yield every message of an OSI file: offset of the zstd frame, offset inside, and bytes."""
+        """Yield for each message of an OSI file: offset of its zstd frame, offset within it, and bytes."""
         stream = _Stream(self._mark)
         content = pieces(self._file)
         while True:
@@ -320,7 +320,7 @@ class OsiFile(MessageFile):
 
 @dataclass(slots=True)
 class _MessageRun:
-    """Group of consecutive messages of one zstd frame, or of an uncompressed file."""
+    """Consecutive messages of one zstd frame, or of a file without compression."""
 
     last_ns: int = 0
     place: int = -1
@@ -337,7 +337,7 @@ class _MessageRun:
         self.times.append(self.last_ns)
 
     def is_full(self, place: int) -> bool:
-        """Return True if the next message does not fit into this group of messages."""
+        """Return True if the next message must begin another group of messages."""
         return place != self.place or self.size > RUN_BYTES or len(self.held) >= RUN_MESSAGES
 
     def messages(self) -> Messages:
@@ -345,7 +345,7 @@ class _MessageRun:
 
 
 class _Stream:
-    """Splitter of the bytes of an OSI file into messages, also after damaged parts.
+    """Splitter of the bytes of an OSI file into messages. It continues after damaged parts.
 
     ``mark`` contains the first bytes common to all messages, if known.
     """
@@ -359,13 +359,13 @@ class _Stream:
         ] = []  # Start of each frame in the stream, and its file offset.
 
     def append(self, place: int, piece: bytes) -> None:
-        """Add the next bytes of the OSI file, with the offset of their zstd frame."""
+        """Add the next bytes of the OSI file. They have the offset of their zstd frame."""
         if not self._frames or self._frames[-1][1] != place:
             self._frames.append((self._start + len(self._buffer), place))
         self._buffer += piece
 
     def take(self, report: Findings, *, ends: bool) -> Iterator[tuple[int, int, bytes]]:
-        """Yield the complete messages in the bytes added so far.
+        """Yield the messages that are complete in the bytes added so far.
 
         ``ends`` is true after the last bytes of the file.
         """
@@ -394,14 +394,14 @@ class _Stream:
             del self._frames[0]
 
     def _overruns(self, at: int, stop: int) -> bool:
-        """Return True if a message's length seems wrong: a message starts inside it, but none at its end."""
+        """Return True if a message's length is probably wrong: another message begins inside it."""
         following = self._buffer[stop + PREFIX.size : stop + PREFIX.size + len(self._mark)]
         if self._mark.startswith(following):
             return False
         return self._resume(at + 1, stop) is not None
 
     def _resume(self, start: int, stop: int | None = None) -> int | None:
-        """Return the probable start of the next message after a damaged part, or ``None``."""
+        """Return the probable start of the next message after a damaged part; ``None`` if none is found."""
         end = None if stop is None else stop - 1 + PREFIX.size + len(self._mark)
         while self._mark:
             found = self._buffer.find(self._mark, start + PREFIX.size, end)
@@ -430,7 +430,7 @@ class _Stream:
 
 
 def _lose(report: Findings, loss: Loss) -> None:
-    """Report a damaged part of a file. Adjacent damaged parts of the same kind are merged."""
+    """Report a damaged part of a file. Adjacent parts with the same damage are reported together."""
     last = report.losses[-1] if report.losses else None
     if last and last.messages == loss.messages == -1 and last.offset + last.bytes == loss.offset:
         report.losses[-1] = replace(last, bytes=last.bytes + loss.bytes)
@@ -442,7 +442,7 @@ def _lose(report: Findings, loss: Loss) -> None:
 
 
 def _beginning(data: bytes) -> bytes:
-    """Return the first bytes that all messages of an OSI file share. Empty without an OSI version."""
+    """Return the first bytes, which are equal in all messages of an OSI file; empty without OSI version."""
     try:
         number, wire, _start, stop = next(fields_of(data, 0, len(data)))
     except (ValueError, StopIteration):
@@ -451,7 +451,7 @@ def _beginning(data: bytes) -> bytes:
 
 
 def _likeness(name: str, data: bytes) -> int:
-    """Return a score for a possible OSI message type: the number of plausible objects, or -1 if invalid.
+    """Return a score for a message's type: number of plausible objects if it has this type; -1 if invalid.
 
     A ground truth decoded as a sensor view, or the other way round, is malformed or empty.
     """
@@ -479,7 +479,7 @@ def _things(placed: list[Any], lanes: Any) -> int:
 
 
 def time_of_bytes(data: bytes) -> int | None:
-    """Return the time stamp of a serialised OSI message; ns. ``None`` means without a valid time."""
+    """Return the time stamp of a serialised OSI message; ns. ``None`` if it has no valid time."""
     seconds, nanos = 0, 0
     try:
         for number, wire, start, stop in fields_of(data, 0, len(data)):

@@ -1,4 +1,4 @@
-"""Conversion of lanes in OSI ground truth messages to a road map, for recordings without an OpenDRIVE map.
+"""Conversion of lanes in OSI messages to a road map, for recordings without an OpenDRIVE map.
 
 OSI has two kinds of lanes. *Logical* lanes are used if the recording has them. They have a border on each side
 with the position along a reference line at every point, the connected lanes at both ends, and rules for
@@ -105,7 +105,7 @@ _FAR: Final = 1e8
 
 @dataclass(frozen=True, slots=True)
 class LaneSignal:
-    """Traffic light or sign of an OSI recording, with the lanes that it applies to.
+    """Traffic light or sign of an OSI recording, with the lanes to which it applies.
 
     ``pose``: columns of :data:`sgstore.model.world.POSE`; ``lanes``: ids of physical or logical lanes.
     """
@@ -117,7 +117,7 @@ class LaneSignal:
 
 
 def _paths(fields: Any) -> Iterator[str]:
-    """Yield the dotted paths of all fields of an OSI lane that the reader needs."""
+    """Yield the dotted path of each field that the reader requires of an OSI lane."""
     for name in fields:
         inner = fields[name] if isinstance(fields, dict) else True
         if name not in _MAY_LACK:
@@ -165,7 +165,7 @@ class OsiLanes:
         self.lost: list[str] = []
 
     def take(self, data: bytes) -> None:
-        """Add the new lanes and lane boundaries of an OSI message."""
+        """Add the lanes and lane boundaries of an OSI message that are new."""
         try:
             message = self._class.FromString(data)
             truth = getattr(message, "global_ground_truth", message)
@@ -185,7 +185,7 @@ class OsiLanes:
                 self._told[name].setdefault(int(thing.id.value), thing)
 
     def text(self, signals: Iterable[LaneSignal] = ()) -> tuple[str, str]:
-        """Return the text of the road map made from the lanes, and the map's name; empty without lanes.
+        """Return the road map made from the lanes as text, and its name; empty without lanes.
 
         ``signals``: lights and signs of the lanes. Of signals with the same name, the first one counts.
 
@@ -229,7 +229,7 @@ class OsiLanes:
         return lane_text(plain, [*self.warnings, *self.lost, *warnings], found), self._name()
 
     def _missing(self, signals: Iterable[LaneSignal], borders: _LaneBoundaries) -> Iterator[str]:
-        """Yield texts about lanes that contradict their boundaries, and about missing lanes and boundaries."""
+        """Yield warnings: lanes that do not fit their boundaries, and missing lanes and boundaries."""
         yield from borders.notes
         if borders.missing:
             yield f"boundaries of lanes are missing: {', '.join(borders.missing)}"
@@ -240,7 +240,7 @@ class OsiLanes:
                 yield f"{signal.kind} {signal.name}: its lanes {', '.join(absent)} are missing"
 
     def _rows(self, lines: Sequence[LaneLine], plain: Sequence[PlainLane]) -> dict[int, list[int]]:
-        """Return the lanes of the road map made from each OSI lane: OSI lane id → row numbers."""
+        """Return the lanes of the road map that were made from each OSI lane: OSI lane id → row numbers."""
         row_of = {lane.name: row for row, lane in enumerate(plain)}
         rows: dict[int, list[int]] = {}
         for line in lines:
@@ -291,7 +291,7 @@ def _plain_signal(signal: LaneSignal, lanes: Iterable[int]) -> PlainSignal:
 
 
 class _LaneBoundaries:
-    """OSI lane boundaries by id, each decoded once."""
+    """OSI lane boundaries by id. Each is decoded once."""
 
     def __init__(
         self, told: dict[str, dict[int, Any]], place: Callable[[Iterable[Any]], Floats]
@@ -304,7 +304,7 @@ class _LaneBoundaries:
         self._logical: dict[int, tuple[Floats, Floats]] = {}
 
     def physical(self, idents: Iterable[Any]) -> tuple[Border, ...]:
-        """Return the lane borders for the ids of physical OSI boundaries. Missing ids are skipped."""
+        """Return the lane borders for ids of physical OSI boundaries. Missing boundaries are left out."""
         found: list[Border] = []
         for ident in map(_number, idents):
             boundary = self.told["lane_boundary"].get(ident)
@@ -318,7 +318,7 @@ class _LaneBoundaries:
         return tuple(found)
 
     def crossed(self, ident: int) -> bool | None:
-        """Return True if vehicles may cross a lane boundary. ``None`` means unknown."""
+        """Return True if vehicles may cross a lane boundary; ``None`` if unknown."""
         boundary = self.told["lane_boundary"].get(ident)
         if boundary is None or not boundary.HasField("classification"):
             return None
@@ -326,7 +326,7 @@ class _LaneBoundaries:
         return None if kind in _UNKNOWN else kind in _CROSSED
 
     def logical(self, idents: Iterable[Any]) -> tuple[Floats, Floats, tuple[Border, ...]]:
-        """Return points, s coordinates and borders of consecutive logical OSI lane boundaries."""
+        """Return points, their ``s`` coordinates, and borders, for a chain of logical OSI lane boundaries."""
         lines: list[Floats] = [np.zeros((0, 3))]
         places: list[Floats] = [np.zeros(0)]
         borders: list[Border] = []
@@ -350,7 +350,7 @@ class _LaneBoundaries:
         return points[order], s[order], tuple(borders)
 
     def _rule(self, boundary: Any) -> tuple[bool | None, bool | None]:
-        """Return the permissions to cross a lane boundary to the left and to the right.
+        """Return two permissions for a lane boundary: to cross it to the left, and to the right.
 
         Without a rule, the type of the physical line counts.
         """
@@ -379,7 +379,7 @@ def _is_area(lane: Any) -> bool:
 
 
 def _area(lane: Any, _borders: _LaneBoundaries) -> Area:
-    """Convert an OSI intersection to an area of the map with the lanes through it."""
+    """Convert an OSI intersection to a junction area of the map: the pairs of lanes that it connects."""
     return Area(
         str(lane.id.value),
         tuple(
@@ -391,7 +391,7 @@ def _area(lane: Any, _borders: _LaneBoundaries) -> Area:
 
 
 def _only_way(lane: Any, borders: _LaneBoundaries) -> LaneLine | None:
-    """Convert an OSI intersection to a single lane, or ``None`` if its boundaries do not form a lane."""
+    """Convert an OSI intersection to a lane; ``None`` if its boundaries do not form a single lane."""
     about = lane.classification
     if len(about.lane_pairing) > 1 or not about.left_lane_boundary_id:
         return None
@@ -436,7 +436,7 @@ def _word(message: Any, field: str) -> str:
 
 
 def _type_of(kind: str, word: str) -> str:
-    """Return the lane type for an OSI lane subtype, else ``driving`` or ``none``."""
+    """Return the lane type for the subtype of an OSI lane, or else ``driving`` or ``none``."""
     if word in _TYPES:
         return _TYPES[word]
     return "driving" if kind in {"TYPE_DRIVING", "TYPE_INTERSECTION"} else "none"
@@ -510,7 +510,7 @@ def _at(line: Floats, s: Floats, cuts: Floats, side: Literal["left", "right"]) -
 
 
 def _physical(lane: Any) -> set[int]:
-    """Return the ids of the physical OSI lanes that a logical OSI lane refers to."""
+    """Return the ids of the physical OSI lanes to which a logical OSI lane refers."""
     return {_number(part.physical_lane_id) for part in getattr(lane, "physical_lane_reference", ())}
 
 
@@ -522,7 +522,7 @@ def _connections(connections: Iterable[Any]) -> tuple[Joint, ...]:
 
 
 def _source(lane: Any) -> dict[str, Any]:
-    """Return road, section and number of the OpenDRIVE lane that an OSI lane was made from.
+    """Return road, section and number of the OpenDRIVE lane from which an OSI lane was made.
 
     The identifiers are the road, the section's s and the lane, in this order; esmini writes ``road_id:1``.
     """
@@ -542,7 +542,7 @@ def _source(lane: Any) -> dict[str, Any]:
 
 
 def _sections_numbered(lines: Sequence[LaneLine]) -> list[LaneLine]:
-    """Return the lanes with road names added, and with sections numbered from 0 in each road."""
+    """Return the lanes with road names. Sections are numbered from 0 in each road."""
     starts: dict[str, set[float]] = {}
     for line in lines:
         if line.road:

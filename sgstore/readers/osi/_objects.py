@@ -103,7 +103,7 @@ TYPES: Final = 1 << 10
 
 @dataclass(slots=True)
 class _ObjectLayout:
-    """Byte positions of the fields in serialised OSI objects, shared by objects with equal structure.
+    """Byte positions of the fields in serialised OSI objects that have the same structure.
 
     ``compared``, ``mask``, ``expected``: positions of all bytes outside numbers, their relevant bits, and the
     values. ``runs``: first column, position and number of adjacent doubles. ``zero``: columns of present
@@ -127,7 +127,7 @@ class _ObjectLayout:
 
 @dataclass(slots=True)
 class _Learned:
-    """Intermediate results while the byte positions of a serialised object's fields are determined."""
+    """Byte positions of a serialised object's fields that were found so far."""
 
     mask: Bytes
     doubles: dict[int, int] = field(default_factory=dict[int, int])
@@ -138,7 +138,7 @@ class _Learned:
 
 
 class MovingObjects:
-    """Fast decoder of serialised OSI moving objects (vehicles, pedestrians) into columns.
+    """Fast decoder of serialised OSI moving objects (vehicles, pedestrians). It returns columns.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ class MovingObjects:
         self._layouts: dict[int, list[_ObjectLayout]] = {}
 
     def read(self, objects: list[bytes]) -> tuple[Floats, Bools, Ints, Ints]:
-        """Decode serialised OSI moving objects into columns: poses, mask of usable objects, lights and types.
+        """Decode serialised moving objects into columns: poses, mask of usable objects, lights and types.
 
         Returns
         -------
@@ -185,7 +185,7 @@ class MovingObjects:
     def _read_alike(
         self, rows: NDArray[np.intp], content: Bytes, columns: tuple[Floats, Bools, Ints, Ints]
     ) -> list[int]:
-        """Decode objects of equal length and layout. Return the rows that have another layout."""
+        """Decode objects with the same length and layout. Return the rows with another layout."""
         values, usable, lights, codes = columns
         odd: list[int] = []
         for _ in range(_ROUNDS):
@@ -207,7 +207,7 @@ class MovingObjects:
         return [*odd, *rows.tolist()]
 
     def _trees(self, found: Any) -> tuple[dict[str, Any], Tree]:
-        """Return the protobuf descriptors of an OSI object's parts, and the fields to read."""
+        """Return the protobuf descriptors of the parts of an OSI object, and the fields to read."""
         base = found.fields_by_name["base"]
         parts: dict[str, Any] = {}
         inner: Tree = {}
@@ -245,7 +245,7 @@ class MovingObjects:
         return parts, tree
 
     def _layout_of(self, content: Bytes) -> _ObjectLayout | None:
-        """Return the byte positions of an object's fields, determined at the first such object.
+        """Return the byte positions of an object's fields. They are determined at the first such object.
 
         ``None`` means that the object has no fixed layout.
         """
@@ -312,7 +312,7 @@ class MovingObjects:
                 found.types.append((at, end, TYPES if known == "type" else 1))
 
     def _read_one(self, content: bytes) -> tuple[Floats, bool, int, int]:
-        """Decode one serialised OSI object with protobuf. A malformed object is unusable."""
+        """Decode one serialised OSI object with protobuf. It is unusable if malformed."""
         values = np.full(len(POSE), np.nan)
         try:
             thing = self._message.FromString(content)
@@ -329,7 +329,7 @@ class MovingObjects:
 
 
 def own_attributes(content: bytes, message: type[Any], *, is_ego: bool) -> dict[str, Any]:
-    """Return the attributes without a column of a serialised OSI moving object.
+    """Return those attributes of a serialised OSI moving object that have no column.
 
     They are references of the type ``net.sgstore`` (``attribute:control_steer=0.2``), as a recording of a live
     run has them, and the ego's angular velocity about the map's x and y axes.
@@ -382,7 +382,7 @@ def _numbers(layout: _ObjectLayout, content: Bytes) -> tuple[Floats, Bools]:
 
 
 def _runs(doubles: dict[int, int]) -> list[tuple[int, int, int]]:
-    """Group adjacent 8-byte numbers. Return first column, byte position and length of each group."""
+    """Group 8-byte numbers that are adjacent. Return first column, byte position and count of each group."""
     runs: list[tuple[int, int, int]] = []
     for column, place in sorted(doubles.items()):
         if runs and (column, place) == (sum(runs[-1][::2]), runs[-1][1] + _DOUBLE * runs[-1][2]):
@@ -423,14 +423,14 @@ def _whole(content: Bytes, start: int, stop: int) -> NDArray[np.uint64]:
 
 
 def code_of(thing: Any) -> int:
-    """Return a code number for an OSI moving object, from its type and vehicle type."""
+    """Return a single code number for the type and vehicle type of an OSI moving object."""
     vehicle = getattr(getattr(thing, "vehicle_classification", None), "type", 0)
     told = (part if 0 <= part < TYPES else TYPES - 1 for part in (thing.type, vehicle))
     return next(told) * TYPES + next(told)
 
 
 def light_bits(thing: Any) -> int:
-    """Return the light mask of an OSI vehicle (indicators, brake lights, …); -1 without light states."""
+    """Return the light mask of an OSI vehicle (indicators, brake lights, …); -1 if it has no light states."""
     state = getattr(getattr(thing, "vehicle_classification", None), "light_state", None)
     if state is None or not state.ListFields():
         return -1
@@ -471,7 +471,7 @@ class _Static:
 
 @dataclass(slots=True)
 class Statics:
-    """Static objects (such as signs and buildings) of an OSI recording, in order of appearance.
+    """Static objects (such as signs and buildings) of an OSI recording, in the order in which they appear.
 
     Attributes
     ----------
@@ -496,7 +496,7 @@ class Statics:
                     self.unplaced.setdefault(words, log_time_ns)
 
     def enter(self, roster: EntityTable, map_text: str) -> None:
-        """Add all static objects to the object table. An object of unknown kind gets its kind from the map."""
+        """Add all static objects to the object table. If a kind is unknown, use the kind in the map."""
         kinds: dict[str, str] | None = None
         for thing in self._found.values():
             meaning = thing.meaning
@@ -545,7 +545,7 @@ class Statics:
 
 
 def _with_value(meaning: TypeMeaning, classification: Any) -> TypeMeaning:
-    """Return the meaning of a speed limit sign, with its value: ``50``, ``35 mph``."""
+    """Return the meaning of a speed limit sign, with its value as in ``50`` or ``35 mph``."""
     if not has_field(type(classification), "value.value") or not classification.value.value > 0:
         return meaning
     value = classification.value
@@ -556,7 +556,7 @@ def _with_value(meaning: TypeMeaning, classification: Any) -> TypeMeaning:
 
 @lru_cache(maxsize=1)  # A recording is read at least twice.
 def kinds_of_map(text: str) -> dict[str, str]:
-    """Return the kind of each object in an OpenDRIVE map: object id → kind."""
+    """Return the kinds of the objects in an OpenDRIVE map: object id → kind."""
     kinds: dict[str, str] = {}
     for match in _MAP_OBJECT.finditer(text):
         told = {name: a or b for name, a, b in _MAP_ATTRIBUTE.findall(match[1])}
@@ -599,7 +599,7 @@ _SUBKINDS: Final = {
 
 
 def lit(mode: int, colour: int) -> int:
-    """Return the state of a traffic light bulb as a bit, from its OSI mode and colour; 0 if it is off."""
+    """Return one bit for the state of a traffic light bulb, from its mode and colour; 0 if it is off."""
     if mode == _MODE_OFF:
         return 0
     if mode == _MODE_FLASHING:
@@ -608,7 +608,7 @@ def lit(mode: int, colour: int) -> int:
 
 
 def shown(bulbs: Iterable[int]) -> int:
-    """Combine the bulbs of a traffic light into one light state, as a code.
+    """Combine the states of a traffic light's bulbs into one state, as a code.
 
     The codes are those of :data:`sgstore.model.vocabulary.LIGHT_STATES`. Flashing has priority. Red with yellow
     is ``red_yellow``. For other combinations, the most restrictive colour counts (a red light with a green
@@ -635,7 +635,7 @@ class _Head:
     top: float = -math.inf
 
     def join(self, pose: tuple[float, ...]) -> None:
-        """Extend the position and size of this traffic light by another bulb."""
+        """Extend this traffic light, so that its position and size include another bulb."""
         _x, _y, z, *rest = pose
         if math.isnan(z):
             return
@@ -649,7 +649,7 @@ class _Head:
 
 
 class TrafficLights:
-    """Traffic lights of an OSI trace. OSI describes single bulbs. Bulbs at one place form a traffic light.
+    """Traffic lights of an OSI trace. Each is made from the single bulbs at one place, as OSI has only bulbs.
 
     Parameters
     ----------
@@ -688,11 +688,11 @@ class TrafficLights:
 
     @property
     def unplaced(self) -> int:
-        """Number of traffic lights that have no position and no map reference."""
+        """Number of traffic lights without position and without map reference."""
         return len(self._heads) - len(self._rows[0])
 
     def update(self, words: list[bytes]) -> None:
-        """Update bulb states from an OSI ground truth message. Bulbs that are not in it keep their states."""
+        """Update bulb states from an OSI message. Bulbs that it does not contain keep their states."""
         if words == self._words or self._class is None:
             return
         news = set(words).difference(self._words)
@@ -714,7 +714,7 @@ class TrafficLights:
         head.bulbs[bulb.id.value] = 0 if out else lit(classification.mode, classification.color)
 
     def signals(self) -> dict[int, LaneSignal]:
-        """Return the traffic lights with assigned lanes: id of the first bulb → light."""
+        """Return the traffic lights to which lanes are assigned: id of the first bulb → light."""
         return {
             head.first: LaneSignal(
                 head.map_ref or f"{OWN}{head.first}",
@@ -727,7 +727,7 @@ class TrafficLights:
         }
 
     def rows(self) -> tuple[Ints, Floats, Ints]:
-        """Return one row per traffic light with a position: node ids, pose columns, states."""
+        """Return a row for each traffic light with a position: node ids, pose columns, states."""
         return self._rows
 
     def _fill(self) -> None:
@@ -739,7 +739,7 @@ class TrafficLights:
         )
 
     def _enter(self, bulb: Any) -> _Head:
-        """Return the traffic light of a bulb. Add a new light if the bulb belongs to no known one."""
+        """Return the traffic light of a bulb. If the bulb belongs to none, add a new traffic light."""
         ident = bulb.id.value
         pose = static_pose(bulb.base) or (NAN,) * 16
         ref, lanes = map_ref(bulb), assigned_lanes(bulb.classification)
@@ -760,7 +760,7 @@ class TrafficLights:
         return head
 
     def _beside(self, pose: tuple[float, ...]) -> _Head | None:
-        """Return the known traffic light at the position of a bulb, or ``None``."""
+        """Return the traffic light at the position of a bulb; ``None`` if the position has none yet."""
         if math.isnan(pose[0]):
             return None
         column, line = _cell(pose)

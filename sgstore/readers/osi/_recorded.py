@@ -1,4 +1,4 @@
-"""Reader of recordings by sgstore's ``Recorder``, which contain OSI messages and exact frames as JSON.
+"""Reader of recordings made by sgstore's ``Recorder``. They contain OSI messages, and exact frames as JSON.
 
 OSI has no fields for some values, such as the kind of a prop, the steering input, and the controls of other
 vehicles.
@@ -23,7 +23,7 @@ FRAME: Final = "sgstore.Frame"
 
 
 class RecordedTrace(FramesTrace):
-    """Recording by sgstore's ``Recorder``, which yields the recorded frames unchanged.
+    """Recording made by sgstore's ``Recorder``. The frames are yielded as they were recorded.
 
     Parameters and attributes are those of :class:`~sgstore.readers.FramesTrace`.
     """
@@ -42,12 +42,12 @@ class RecordedTrace(FramesTrace):
         return {FRAME: "ground_truth", ROAD_MAP: "map"}.get(channel.schema, "payload")
 
     def map_text(self, message: TraceMessage) -> str:
-        """Return the OpenDRIVE text in the message of the road map."""
+        """Return the OpenDRIVE text in a message with the road map."""
         record = self.recording.channels[message.channel.id]
         told = message_class(self.recording.schemas[record.schema_id]).FromString(message.data)
         self._map_name = str(told.map_reference).replace("\\", "/").rpartition("/")[2]
         return str(told.open_drive_xml_content)
 
     def frame(self, message: TraceMessage) -> Frame:
-        """Return a recorded frame."""
+        """Return the frame in a message."""
         return Frame.from_dict(json.loads(message.data))

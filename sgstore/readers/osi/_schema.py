@@ -1,4 +1,4 @@
-"""Protobuf message classes of ASAM OSI, reduced to the fields that the reader needs.
+"""Protobuf message classes of ASAM OSI with only the fields that the reader needs.
 
 A ground truth consists mostly of lanes and boundaries, and a sensor view may contain whole pictures. Unused
 fields are removed from the descriptors, so that protobuf does not parse their bytes. Messages with much static
@@ -47,13 +47,13 @@ OPAQUE: Final = "opaque"
 
 @cache
 def fields_read() -> dict[str, Any]:
-    """Return the content of ``osi_fields.toml``: message types with the fields that the reader uses."""
+    """Return the content of ``osi_fields.toml``: the fields that the reader uses of each message type."""
     text = resources.files("sgstore.readers").joinpath("osi_fields.toml").read_text("utf-8")
     return tomllib.loads(text)
 
 
 def prune(files: list[descriptor_pb2.FileDescriptorProto], roots: dict[str, Any]) -> None:
-    """Remove the unused fields from protobuf descriptors, for faster parsing.
+    """Remove unused fields from protobuf descriptors, so that parsing is faster.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ _STATICS: Final = frozenset({4, 6, 7})
 
 
 def fields_of(data: bytes, position: int, stop: int) -> Iterator[tuple[int, int, int, int]]:
-    """Yield the fields of a protobuf message: number, wire type, start and end of the content.
+    """Yield for each field in a protobuf message: number, wire type, start and end of its content.
 
     Raises
     ------
@@ -183,7 +183,7 @@ _WIDTHS: Final = {1: 8, 3: 0, 4: 0, 5: 4}
 
 
 def _varint(data: bytes, position: int, stop: int) -> tuple[int, int]:
-    """Decode a protobuf varint. Return its value, and the position after it.
+    """Decode a protobuf varint. Return its value and the position after it.
 
     Raises
     ------
@@ -222,7 +222,7 @@ _SCALARS: Final = {
 
 @cache
 def descriptors() -> bytes:
-    """Return the serialised protobuf descriptors of ``osi3.GroundTruth`` and ``osi3.SensorView``."""
+    """Return serialised protobuf descriptors of ``osi3.GroundTruth`` and ``osi3.SensorView``."""
     text = resources.files("sgstore.readers").joinpath("osi_types.toml").read_text(encoding="utf-8")
     tables = tomllib.loads(text)
     file = descriptor_pb2.FileDescriptorProto(name="osi3.proto", package="osi3", syntax="proto2")
@@ -404,7 +404,7 @@ def _require(found: Descriptor, paths: tuple[str, ...]) -> None:
 
 
 def object_class(message: type[Any]) -> type[Any]:
-    """Return the protobuf class of moving objects that belongs to an OSI message class.
+    """Return the protobuf class of moving objects that an OSI message class uses.
 
     Messages contain these objects as bytes.
 
@@ -422,7 +422,7 @@ def object_class(message: type[Any]) -> type[Any]:
 
 
 def part_class(message: type[Any], name: str) -> type[Any] | None:
-    """Return the protobuf class of a type that an OSI message class uses, or ``None`` if unreadable.
+    """Return the protobuf class of a type that an OSI message class uses; ``None`` if it is unreadable.
 
     Messages contain these parts as bytes: traffic lights, and the conditions of the environment.
     """
@@ -439,7 +439,7 @@ def _class_beside(message: type[Any], name: str, needs: tuple[str, ...]) -> type
 
 
 def lights_of(ground: Any) -> list[bytes]:
-    """Return the traffic lights of an OSI ground truth message in serialised form."""
+    """Return the traffic lights in an OSI ground truth message, in serialised form."""
     return list(getattr(ground, "traffic_light", ()))
 
 
@@ -453,7 +453,7 @@ def has_field(message: type[Any], path: str) -> bool:
 
 
 def parse(message: type[Any], data: bytes) -> tuple[Any, Any, list[bytes]]:
-    """Parse an OSI message. Return the message, its ground truth part, and its serialised moving objects.
+    """Parse an OSI message. Return it, its ground truth part, and its moving objects in serialised form.
 
     Raises
     ------
@@ -471,7 +471,7 @@ def parse(message: type[Any], data: bytes) -> tuple[Any, Any, list[bytes]]:
 
 
 def time_of(message: Any, ground: Any) -> int | None:
-    """Return the time stamp of an OSI message; ns. ``None`` means without one.
+    """Return the time stamp of an OSI message; ns. ``None`` if it has none.
 
     A stamp out of the valid range is returned only without a valid one.
     """
@@ -487,7 +487,7 @@ def time_of(message: Any, ground: Any) -> int | None:
 
 @lru_cache(maxsize=64)
 def _truth_in(message: type[Any]) -> int:
-    """Return the field number of the ground truth in an OSI message class; 0 for a ground truth class."""
+    """Return the field number of the ground truth in an OSI message class; 0 if it is the class itself."""
     truth = message.DESCRIPTOR.fields_by_name.get("global_ground_truth")
     return truth.number if truth is not None else 0
 
@@ -510,7 +510,7 @@ def enum_name(message: Any, field: str) -> str:
 
 @lru_cache(maxsize=256)
 def _values_of(message: type[Any], field: str) -> tuple[dict[int, str], int]:
-    """Return the value names of a protobuf enumeration field by number, and the field number."""
+    """Return the value names of a protobuf enumeration field (number → name), and the field's number."""
     descriptor = message.DESCRIPTOR.fields_by_name[field]
     names = descriptor.enum_type.values_by_number
     # Read one by one: if a number has several names, the first one counts.
@@ -518,7 +518,7 @@ def _values_of(message: type[Any], field: str) -> tuple[dict[int, str], int]:
 
 
 def identifiers(thing: Any) -> list[tuple[str, str]]:
-    """Return the source references of an OSI object in order: (type of the source, identifier).
+    """Return the source references of an OSI object in order, as pairs (type of source, identifier).
 
     Raises
     ------
@@ -537,7 +537,7 @@ def identifiers(thing: Any) -> list[tuple[str, str]]:
 
 
 def map_ref(thing: Any) -> str:
-    """Return the id of the OpenDRIVE signal or object that an OSI object refers to, or an empty string.
+    """Return the id of the OpenDRIVE signal or object to which an OSI object refers; empty if none.
 
     esmini writes ``traffic_light_id:3``, ``traffic_sign_id:3`` and ``object_id:3``. A plain identifier is
     returned unchanged.
@@ -550,7 +550,7 @@ def map_ref(thing: Any) -> str:
 
 
 def assigned_lanes(classification: Any) -> list[int]:
-    """Return the ids of all OSI lanes that a traffic light or sign applies to.
+    """Return the ids of all OSI lanes to which a traffic light or sign applies.
 
     Raises
     ------
@@ -569,7 +569,7 @@ def assigned_lanes(classification: Any) -> list[int]:
 
 
 def static_pose(base: Any) -> tuple[float, ...] | None:
-    """Return the pose and size of a static OSI object, or ``None`` without a usable position.
+    """Return the pose and size of a static OSI object; ``None`` if it has no usable position.
 
     The columns are those of :data:`sgstore.model.world.POSE`. A missing orientation or dimension is NaN.
     """

@@ -1,4 +1,4 @@
-"""First pass over an OSI recording: find moving objects, ego and road map.
+"""First reading of an OSI recording: find moving objects, ego and road map.
 
 The id of an object is a number from the simulator, which often changes between runs. Users know an object by
 its name in the scenario. If the recording contains a unique name, it becomes the entity's ident; otherwise, the
@@ -58,7 +58,7 @@ _MOST_HOSTS: Final = 100
 
 
 def names_of(moving_object: Any) -> list[str]:
-    """Return the possible names of an OSI moving object, best first, from its source references."""
+    """Return possible names of an OSI moving object, the best first. They come from its source references."""
     parts = [text.partition(":") for _, text in identifiers(moving_object)]
     named = [value for key, _, value in parts if key == "entity_name" and value]
     bare = [key for key, colon, _ in parts if key and not colon and key not in _SORTS]
@@ -73,7 +73,7 @@ def _names_or_none(moving_object: Any) -> list[str]:
 
 
 def hosts_of(message: Any) -> list[int]:
-    """Return the possible ids of the host vehicle (ego) in an OSI message, best first; 0 is a valid id."""
+    """Return possible ids of the host vehicle (ego) in an OSI message, the best first. 0 is a valid id."""
     names = ("global_ground_truth", "host_vehicle_data")
     inner: list[Any] = [getattr(message, name, None) for name in names]
     parts = [message, *(part for part in inner if hasattr(part, "DESCRIPTOR"))]
@@ -82,7 +82,7 @@ def hosts_of(message: Any) -> list[int]:
 
 
 def keys_of(objects: list[bytes], last: list[bytes]) -> list[bytes]:
-    """Return the first bytes of each serialised OSI object. They contain the object's id.
+    """Return the first bytes of each serialised OSI object, up to the end of its id.
 
     If the objects match ``last``, an earlier result of this function, the same list is returned.
     """
@@ -95,14 +95,14 @@ def keys_of(objects: list[bytes], last: list[bytes]) -> list[bytes]:
 
 
 def is_key(key: bytes, thing: Any) -> bool:
-    """Return True if the first bytes of a serialised OSI object are exactly its id."""
+    """Return True if the given first bytes of a serialised OSI object are its id, and nothing else."""
     ident = thing.id.SerializeToString()
     return len(ident) < 0x80 and key == b"\x0a" + bytes([len(ident)]) + ident
 
 
 @dataclass(slots=True)
 class Cast:
-    """Moving objects of an OSI recording, with their names and possible egos.
+    """Moving objects of an OSI recording, their names, and possible egos.
 
     Attributes
     ----------
@@ -149,7 +149,7 @@ class Cast:
                 self._keys.add(key)
 
     def idents(self) -> dict[int, str]:
-        """Return the name of each moving object if the name is unique, otherwise its number."""
+        """Return the name of each moving object; its number if the name is not unique."""
         numbers = {str(number) for number in self.names}
         bearers = Counter(names[0] for names in self.names.values() if names)
         return {
@@ -160,7 +160,7 @@ class Cast:
         }
 
     def ego(self, wanted: str, notes: list[str]) -> int | None:
-        """Return the OSI id of the ego vehicle, or ``None``.
+        """Return the OSI id of the ego vehicle; ``None`` if no ego is known.
 
         Parameters
         ----------
@@ -229,7 +229,7 @@ STATIC_FIELDS: Final = (
 
 @dataclass(slots=True)
 class _Latch:
-    """Collector of the messages with lanes that are recorded only once. Later messages need them.
+    """Collector of messages with static objects or lights on which later messages depend.
 
     A static object is defined by the first message that contains it. If all later messages contain it, too,
     none depends on the first. A light's state is defined by the last message before one without the light.
@@ -246,7 +246,7 @@ class _Latch:
     refs: dict[Ref, None] = field(default_factory=dict[Ref, None])
 
     def look(self, told: Mapping[str, Any], words: list[bytes], ref: Ref) -> bool:
-        """Examine the lanes of a message. Return True if it has a new lane or boundary.
+        """Examine the static objects and lights of a message. Return True if a lane or lane boundary is new.
 
         Parameters
         ----------
@@ -285,7 +285,7 @@ class _Latch:
 
 @dataclass(slots=True, kw_only=True)
 class OsiLead(Lead):
-    """Channel with OSI messages, as a candidate for the frames of the trace.
+    """Channel of an OSI recording. It may become the frame channel.
 
     ``objects``: class of its moving objects. ``latch``: its messages that others depend on. ``lanes``: its
     lanes; ``None`` if they are unreadable. The weight of a frame is 1 if it has moving objects.
@@ -299,7 +299,7 @@ class OsiLead(Lead):
 
 
 def schema_name(recording: Recording, channel: int) -> str:
-    """Return the schema name of a channel with protobuf messages, else an empty string."""
+    """Return the schema name of a channel with protobuf messages, otherwise an empty text."""
     record = recording.channels[channel]
     schema = recording.schemas.get(record.schema_id)
     protobuf = schema is not None and "protobuf" in {schema.encoding, record.message_encoding}
@@ -307,7 +307,7 @@ def schema_name(recording: Recording, channel: int) -> str:
 
 
 class OsiSurvey(Survey[OsiLead]):
-    """First pass over an OSI recording, which collects the facts that the frames need.
+    """First reading of an OSI recording. It collects information that the frames need.
 
     The map is OpenDRIVE if the recording contains it. Otherwise, it is made of the lanes in the ground truth.
 
@@ -340,11 +340,11 @@ class OsiSurvey(Survey[OsiLead]):
         self._lights: dict[int, TrafficLights] = {}  # By channel.
 
     def rank(self, lead: OsiLead) -> tuple[int, ...]:
-        """Return the sort key of a channel for the choice of the frame channel: frames with objects first."""
+        """Return the sort key of a channel for the choice of the frame channel. Frames with objects win."""
         return lead.weight, lead.frames, lead.schema == GROUND_TRUTH
 
     def read(self) -> Self:
-        """Read all messages once, collect the facts, and make a road map from lanes if it is missing."""
+        """Read all messages once and collect information. If the road map is missing, make one from lanes."""
         super().read()
         if not self.map_text:
             leading = self.first_lead()
@@ -359,7 +359,7 @@ class OsiSurvey(Survey[OsiLead]):
         return f"no ground truth message can be read from {where}"
 
     def find_ego(self) -> str:
-        """Find the ego among the moving objects, and return its id as text."""
+        """Find the ego among the moving objects. Return its id as text."""
         self.ego = self.cast.ego(self.wanted, self.about_ego)
         self.follows = not self.wanted and self.ego in self.cast.hosts
         return "" if self.ego is None else self.cast.idents()[self.ego]
@@ -370,7 +370,7 @@ class OsiSurvey(Survey[OsiLead]):
         return "map" if is_map else super().role(channel)
 
     def context(self) -> set[Ref]:
-        """Return the file positions of messages that are needed to read later messages.
+        """Return the file positions of the messages that later messages need.
 
         For other channels than the leading one, these are the first messages with each static object.
         """
@@ -382,11 +382,11 @@ class OsiSurvey(Survey[OsiLead]):
         return refs
 
     def keeps(self, channel: int) -> bool:
-        """Return True if the second pass, which builds the frames, needs the messages of a channel."""
+        """Return True if messages of a channel are needed in the second reading, which makes the frames."""
         return schema_name(self.recording, channel) in {GROUND_TRUTH, SENSOR_VIEW, HOST_DATA}
 
     def meet(self, channel: int) -> bool:
-        """Return True if a channel contains frames or maps. A new channel gets a decoder."""
+        """Return True if a channel contains frames or maps. If so, prepare a decoder for it."""
         if channel in self.leads or channel in self._maps:
             return True
         name = schema_name(self.recording, channel)
@@ -422,7 +422,7 @@ class OsiSurvey(Survey[OsiLead]):
         )
 
     def look(self, run: Messages, row: int) -> None:
-        """Collect facts from one OSI message: a road map or a frame."""
+        """Collect information from an OSI message: a road map or a frame."""
         channel = int(run.channel[row])
         if channel in self._maps:
             self._look_at_map(self._maps[channel], run, row)
@@ -464,7 +464,7 @@ class OsiSurvey(Survey[OsiLead]):
         self.count(run, row, len(objects) > 0)
 
     def _make_map_of_lanes(self, leading: int) -> None:
-        """Make a road map from the OSI lanes. Lanes from the channel of the frames have priority."""
+        """Make a road map from OSI lanes. Prefer the lanes in the frame channel."""
         for _, lead in sorted(self.leads.items(), key=lambda item: item[0] != leading):
             if lead.lanes is None:
                 continue

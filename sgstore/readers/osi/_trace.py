@@ -62,7 +62,7 @@ _CLASSES: Final = (
 
 
 class Environment:
-    """Weather and light conditions of an OSI trace, reported as events.
+    """Weather and light of an OSI trace. Each change becomes an event.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ class Environment:
         self._class = part_class(message, CONDITIONS)
 
     def look(self, ground: Any, time_ns: int, log_time_ns: int, seq: int) -> None:
-        """Update the weather and light conditions from an OSI message, and report changes as events.
+        """Read weather and light from an OSI message. Add an event for each change.
 
         Missing conditions keep their values.
         """
@@ -103,14 +103,14 @@ class Environment:
         self._roster.happen(Event("environment", time_ns, log_time_ns, seq, detail=detail))
 
     def settle(self) -> None:
-        """Add a warning about unreadable weather and light conditions to the report."""
+        """Add a warning to the report if weather and light could not be read."""
         if self._unread:
             words = f"weather and light cannot be read where they changed {self._unread} times"
             self._roster.report.warnings.append(words)
 
 
 def classes_of(conditions: Any) -> str:
-    """Return weather and light classes as text, such as ``precipitation=light, fog=mist``."""
+    """Return classes of weather and light as text, such as ``precipitation=light, fog=mist``."""
     told = [(word, _class(conditions, field)) for word, field in _CLASSES]
     if "clouds" in conditions.DESCRIPTOR.fields_by_name and conditions.HasField("clouds"):
         told.append(("clouds", _class(conditions.clouds, "fractional_cloud_cover")))
@@ -118,7 +118,7 @@ def classes_of(conditions: Any) -> str:
 
 
 def numbers_of(conditions: Any) -> list[str]:
-    """Return time of day and temperature of an OSI message as texts, if known."""
+    """Return the known ones of time of day and temperature in an OSI message, as texts."""
     told: list[str] = []
     if conditions.HasField("time_of_day"):
         minutes, seconds = divmod(conditions.time_of_day.seconds_since_midnight % 86_400, 60)
@@ -129,7 +129,7 @@ def numbers_of(conditions: Any) -> list[str]:
 
 
 def _class(message: Any, field: str) -> str:
-    """Return an OSI enumeration value in lower case without its common prefix; empty if unknown."""
+    """Return an OSI enumeration value in lower case without the prefix of its type; empty if unknown."""
     told = message.DESCRIPTOR.fields_by_name.get(field)
     if told is None or told.enum_type is None or not message.HasField(field):
         return ""
@@ -166,7 +166,7 @@ _MOST_AHEAD: Final = 16
 
 @dataclass(slots=True)
 class OsiRawFrame:
-    """Frame of an OSI recording before conversion, with serialised objects.
+    """Frame of an OSI recording before conversion. Its objects are still serialised.
 
     Attributes
     ----------
@@ -234,7 +234,7 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
         self._frames = 0
 
     def decode(self, run: Messages, row: int) -> OsiRawFrame | None:
-        """Return the raw frame that an OSI message starts; ``None`` for any other message.
+        """Return the frame that an OSI message starts, before conversion; ``None`` for other messages.
 
         Other contents of the message are stored.
         """
@@ -286,7 +286,7 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
             self._warn_of_egos(NO_EGO)
 
     def complete(self, frames: list[OsiRawFrame]) -> list[FrameRows]:
-        """Convert raw OSI frames to frames with poses, speeds and sizes, many frames at once."""
+        """Convert OSI frames: compute poses, speeds and sizes of many frames at once."""
         objects = [content for frame in frames for content in frame.objects]
         values, usable, lights, codes = self._objects.read(objects)
         turned = usable & (np.abs(values[:, _HEADING]) > math.pi)
@@ -325,7 +325,7 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
     def _other_kinds(
         self, frames: list[OsiRawFrame], node: Ints, codes: Ints, objects: list[bytes]
     ) -> dict[int, dict[int, Called]]:
-        """Return the objects whose kind differs from their first kind: frame → node id → kind."""
+        """Return the objects whose kind has changed since their first frame: frame → node id → present kind."""
         entered = np.full(self.roster.size, -1, np.int64)
         entered[[*self._codes]] = [*self._codes.values()]
         rows = np.flatnonzero((codes >= 0) & (codes != entered[node]))
@@ -346,7 +346,7 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
     def _frame(
         self, told: tuple[Any, Any, list[bytes]], time_ns: int, log_time: int, channel: int
     ) -> OsiRawFrame | None:
-        """Return a new raw frame for a message, or ``None`` if the message continues the last frame."""
+        """Return a new frame for a message; ``None`` if the message continues the frame before."""
         message, ground, contents = told
         nodes, objects = self._met(contents, log_time)
         last, before, self._told_by = self._open, self._told_by, channel
@@ -374,7 +374,7 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
     def _join(
         self, frame: OsiRawFrame, message: Any, nodes: list[int], objects: list[bytes]
     ) -> None:
-        """Add the objects and vehicle controls of a message to a frame that has none."""
+        """Add objects and vehicle controls of a message to a frame, unless the frame already has them."""
         if not frame.nodes:
             frame.nodes, frame.objects = nodes, objects
         else:
@@ -398,14 +398,14 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
         )
 
     def _take_controls(self, data: Any, log_time: int) -> None:
-        """Store the vehicle controls of the ego. If the log time is equal, add them to the last frame."""
+        """Remember the vehicle controls of the ego. Add them to the last frame if it has the same log time."""
         self._controls = told = controls_of(data)
         last = self._open
         if last is not None and log_time == last.log_time_ns:
             last.controls = _first_told(last.own, told)
 
     def _take_aside(self, told: tuple[Any, Any, list[bytes]], time_ns: int) -> None:
-        """Add another channel's objects to the frame of the same time, or store them for a later frame."""
+        """Add objects of another channel to the frame of the same time, or keep them for a later frame."""
         message, ground, contents = told
         last = self._open
         self._lights.update(lights_of(ground))
@@ -422,14 +422,14 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
             self._leave_aside(contents)
 
     def _leave_aside(self, contents: list[bytes]) -> None:
-        """Count the objects of a message whose time has no frame."""
+        """Count the objects of a message if no frame has the same time."""
         for content in contents:
             with suppress(*DECODE_ERRORS):
                 ident = int(self._class.FromString(content).id.value)
                 self._aside[ident] = self._aside.get(ident, 0) + 1
 
     def _met(self, objects: list[bytes], log_time: int) -> tuple[list[int], list[bytes]]:
-        """Return node ids and bytes of the serialised objects, without unreadable objects and duplicates."""
+        """Return node ids and bytes of serialised objects. Leave out unreadable objects and duplicates."""
         keys = keys_of(objects, self._last_keys)
         if keys is self._last_keys:  # The same objects as in the last frame, in the same order.
             return self._last_nodes.copy(), objects
@@ -451,7 +451,7 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
         return list(rows), [objects[row] for row in rows.values()]
 
     def _node_of(self, content: bytes, key: bytes, log_time: int) -> int:
-        """Decode the id of an object that was not seen before, and return its node id; -1 if malformed.
+        """Decode the id of a new object, and return its node id; -1 if it is malformed.
 
         A new object is added.
         """
@@ -479,7 +479,7 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
         return node
 
     def _trailer(self, thing: Any) -> str:
-        """Return the id of the trailer that a vehicle pulls, or an empty string."""
+        """Return the id of the trailer that a vehicle pulls; empty if it pulls none."""
         vehicle = getattr(thing, "vehicle_classification", None)
         if vehicle is None or not has_field(type(vehicle), "trailer_id"):
             return ""
@@ -516,11 +516,11 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
             self._unusable.add(words, log_time)
 
     def _number(self, node: int) -> int:
-        """Return the id of a moving object in the OSI recording, from its node id."""
+        """Return the id that a moving object has in the OSI recording, for a node id."""
         return next(ident for ident, known in self._nodes.items() if known == node)
 
     def _usable(self, frame: FrameRows, usable: Bools, ego: int) -> FrameRows:
-        """Return a frame without the rows of unusable objects."""
+        """Return a frame without the rows of objects that are unusable."""
         for node in frame.node[~usable].tolist():
             words = f"moving object {self._number(node)} has no usable pose"
             self._unusable.add(words, frame.log_time_ns)
@@ -536,7 +536,7 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
 
 
 def controls_of(data: Any) -> tuple[float, ...]:
-    """Return the vehicle controls in an OSI message about the host vehicle; NaN for missing ones.
+    """Return the vehicle controls in an OSI message about the host vehicle. Missing ones are NaN.
 
     The columns are :data:`sgstore.model.world.INPUTS`. Steering is always NaN, because the angle of the
     steering wheel is not normalised and its range is unknown. The hand brake is always NaN, because OSI has
@@ -552,7 +552,7 @@ def controls_of(data: Any) -> tuple[float, ...]:
 
 
 def _first_told(*controls: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the first known value of each vehicle control (steering, throttle, …)."""
+    """For each vehicle control (steering, throttle, …), return the first known value."""
     return tuple(
         next((value for value in values if not math.isnan(value)), NAN)
         for values in zip(*controls, strict=True)

@@ -1,4 +1,4 @@
-"""Log of 123D (a folder of Arrow files) with the interface of an MCAP file: a map, and one message per frame.
+"""Log of 123D (a folder of Arrow files), read like an MCAP file: a map, and a message per frame.
 
 A frame is a row of ``box_detections_se3.arrow``, or of ``ego_state_se3.arrow`` if there are no boxes. The state
 of the ego is interpolated. The schema of each file has metadata in MessagePack. The road map is ``map.arrow``
@@ -59,7 +59,7 @@ _FAULTS: Final = (
 
 
 class Py123dFile(NumberedFile):
-    """Log of 123D with the interface of an MCAP file (log of messages).
+    """Log of 123D that can be read like an MCAP file (log of messages).
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ class Py123dFile(NumberedFile):
         self.losses += lost
 
     def message(self, number: int) -> bytes:
-        """Return the bytes of a message by number: 0 is the map, 1 and higher are the frames."""
+        """Return the bytes of the message with a number: 0 is the map, the others are frames."""
         if number == 0:
             return self._map.text
         time = self.time_of(number)
@@ -115,12 +115,12 @@ class Py123dFile(NumberedFile):
         return self._boxes.message(time, EGO, self._steps[number - 1].tolist(), **more)
 
     def time_of(self, number: int) -> int:
-        """Return the time of a frame by number, from 1; ns."""
+        """Return the time of the frame with a number, from 1; ns."""
         return int(self._times[self._steps[number - 1][0]])
 
 
 def _metadata(table: Any, lost: list[str]) -> dict[str, Any]:
-    """Return the metadata in the schema of a file; empty if they are damaged."""
+    """Return the metadata that the schema of a file contains; empty if they are damaged."""
     try:
         told = unpacked((table.schema.metadata or {})[b"metadata"])
         if isinstance(told, dict):
@@ -136,7 +136,7 @@ def _column(table: Any, key: str, name: str) -> list[Any]:
 
 
 def _times_of(table: Any, key: str) -> Any:
-    """Return the times of a table; ns; -1 if missing."""
+    """Return the times in a table; ns. A missing time is -1."""
     told = _column(table, key, "timestamp_us")
     return np.array([one * 1000 if _is_time(one) else -1 for one in told], np.int64)
 
@@ -146,7 +146,7 @@ def _is_time(value: Any) -> bool:
 
 
 def _read_boxes(files: dict[str, Path], lost: list[str]) -> tuple[Boxes, Any]:
-    """Return all boxes of a log with the ego in each frame, and their times; ns."""
+    """Return all boxes of a log, including the ego in each frame, and the time of each box; ns."""
     ident: list[str] = []
     kind: list[str] = []
     times: list[int] = []
@@ -199,14 +199,14 @@ def _read_boxes(files: dict[str, Path], lost: list[str]) -> tuple[Boxes, Any]:
 
 
 def _numbers(told: Any, count: int) -> list[float]:
-    """Return a list of numbers of a given length; NaN if it is missing or malformed."""
+    """Return a list of numbers with a given length. It is all NaN if missing or malformed."""
     if not isinstance(told, list) or len(told) != count:
         return [np.nan] * count
     return [np.nan if one is None else float(one) for one in told]
 
 
 def _ego_states(path: Path, frames: Any, lost: list[str]) -> tuple[Any, Floats]:
-    """Return the times of the frames, and the ego's box, velocity, acceleration and yaw rate at each time.
+    """Return the frame times, and the ego's box, velocity, acceleration and yaw rate at each.
 
     Without times of boxes, the frames are those of the ego.
     """
@@ -246,7 +246,7 @@ def _number(value: Any) -> float:
 
 
 class _Lights:
-    """States of traffic lights by lane, over time. A state is valid for one second."""
+    """States of traffic lights by lane over time. Each state is valid for one second."""
 
     def __init__(self, path: Path | None, lost: list[str]) -> None:
         self._times: Any = np.zeros(0, np.int64)
@@ -270,7 +270,7 @@ class _Lights:
         self._times, self._shown = times[order], [self._shown[row] for row in order.tolist()]
 
     def at(self, time_ns: int) -> dict[str, str]:
-        """Return the states at a time: lane → state."""
+        """Return the states of lights at a time: lane → state."""
         row = int(np.searchsorted(self._times, time_ns, side="right")) - 1
         if row < 0 or not 0 <= time_ns - self._times[row] <= FURTHEST:
             return {}
@@ -284,13 +284,13 @@ def _label_sets() -> dict[str, list[str]]:
 
 
 def _labels(about: dict[str, Any]) -> dict[int, str]:
-    """Return the label names of a data set by number, from the metadata of its boxes."""
+    """Return the label names of a data set: number → name. The metadata of boxes name the data set."""
     name = str(about.get("box_detection_label_class", "")).rpartition(".")[2]
     return dict(enumerate(_label_sets().get(name, [])))
 
 
 def _map_of(path: Path, files: dict[str, Path], about: dict[str, Any], lost: list[str]) -> Lanes:
-    """Return the road map of a log. It is empty without a map. A damaged map is reported as lost."""
+    """Return the road map of a log; empty if it has none. A damaged map is reported as lost."""
     file = files.get("map")
     dataset, location = (str(about.get(key) or "") for key in ("dataset", "location"))
     if file is None and dataset and location and "/" not in dataset + location:

@@ -26,14 +26,14 @@ _TYPES: Final = {3: "biking", 4: "bus"}
 
 
 class Lanes(NamedTuple):
-    """Road map as a text of lanes, and the position of the start of each lane by name; m."""
+    """Road map in the lane text format, and the start position of each lane by name; m."""
 
     text: bytes
     starts: dict[str, tuple[float, float, float]]
 
 
 def read_lanes(table: Any, lost: list[str]) -> Lanes:
-    """Return the road map in a table of map objects. Report damaged objects as lost.
+    """Return the road map made from a table of map objects. Report damaged objects as lost.
 
     Raises
     ------
@@ -74,7 +74,7 @@ def read_lanes(table: Any, lost: list[str]) -> Lanes:
 
 
 def _points(told: Any) -> Any:
-    """Return points (n, 3), without repeated points."""
+    """Return points (n, 3). Repeated points are removed."""
     line = np.asarray(told, np.float64)
     if line.ndim != 2 or line.shape[1] != 3 or not (np.abs(line) < 1e8).all():
         raise ValueError("a line has an impossible point")

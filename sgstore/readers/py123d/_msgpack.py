@@ -80,7 +80,7 @@ def _value(data: bytes, at: int, depth: int) -> tuple[Any, int]:
 
 
 def _array(told: dict[Any, Any]) -> Any:
-    """Convert a map with the key ``__ndarray__`` to a numpy array. Other maps are unchanged."""
+    """Convert a mapping with the key ``__ndarray__`` to a numpy array. Return other mappings unchanged."""
     if b"__ndarray__" not in told:
         return told
     if told[b"dtype"] not in _DTYPES:

@@ -20,11 +20,11 @@ class Py123dTrace(BoxesTrace):
 
     @staticmethod
     def role(channel: Channel) -> str:
-        """Return the role of a channel: ``ground_truth`` for frames, ``map``, else ``payload``."""
+        """Return the role of a channel: ``ground_truth`` for frames, ``map``, or otherwise ``payload``."""
         return {FRAME: "ground_truth", MAP: "map"}.get(channel.schema, "payload")
 
     def add_lights(self, frame: Frame, told: dict[str, Any]) -> None:
-        """Add the traffic lights of the lanes. Each is placed at the start of its lane."""
+        """Add the traffic lights of lanes to a frame. Each is placed at the start of its lane."""
         still = dict.fromkeys(("vx", "vy", "vz", "ax", "ay", "az", "yaw_rate"), 0.0)
         for one in told.get("lights", ()):
             place = one["x"], one["y"], one["z"]

@@ -1,3 +1,3 @@
-"""Containers of ROS messages other than MCAP: rosbag2's SQLite files, and bags of ROS 1."""
+"""Containers of ROS messages other than MCAP: SQLite files of rosbag2, and bags of ROS 1."""
 
 __all__ = []

@@ -1,4 +1,4 @@
-"""Definitions of message types for bags without them, and conversion of ROS 1 messages into CDR.
+"""Message type definitions for bags that lack them, and conversion of ROS 1 messages into CDR.
 
 Older bags of rosbag2 (up to Humble) have no definitions. They are taken from the package ``rosbags`` (standard
 types) or from a ROS installation (``AMENT_PREFIX_PATH``). A bag of ROS 1 has definitions, and the package
@@ -56,7 +56,7 @@ class Definitions:
                 self._register(told, name)
 
     def text(self, topic: Topic) -> str:
-        """Return the definition of a topic's type in the format ``ros2msg``. Empty if it is unknown."""
+        """Return the type definition of a topic in the format ``ros2msg``; empty if it is unknown."""
         name = topic.type
         if not _NAME.fullmatch(name):
             return ""
@@ -88,7 +88,7 @@ class Definitions:
         return convert
 
     def _registered(self, topic: Topic) -> str:
-        """Register the definition of a ROS 1 type, and return it in the format ``ros2msg``."""
+        """Register the definition of a ROS 1 type. Return it in the format ``ros2msg``."""
         if len(topic.definition) > MAX_TEXT:
             return self._without(topic.type, "the definition is too long")
         name = _full(topic.type)
@@ -96,7 +96,7 @@ class Definitions:
         return self._store.generate_msgdef(name, ros_version=2)[0]
 
     def _register(self, text: str, name: str) -> None:
-        """Register the types in a definition that are not registered yet."""
+        """Register those types in a definition that are not registered yet."""
         known = self._store.types
         found = _parsed(text, name).items()
         self._store.register({key: value for key, value in found if key not in known})
@@ -137,7 +137,7 @@ def _store(name: str) -> Any:
 
 
 def _installed(name: str) -> str:
-    """Return the definition of a type, with all types in it, from a ROS installation. Empty if not found."""
+    """Return the definition of a type and its parts, from a ROS installation; empty if not found."""
     wanted, text = [_full(name)], ""
     for part in wanted:
         package, _, short = part.split("/")

@@ -1,4 +1,4 @@
-"""ROS bags with the interface of an MCAP file: CDR messages with the definitions of their types.
+"""ROS bags, read like MCAP files: CDR messages with the definitions of their types.
 
 The readers of ROS flavours therefore read these containers, too. A place in a bag is the number of a message in
 the container.
@@ -30,7 +30,7 @@ ENDINGS = (".db3", ".bag")
 
 
 class RosbagFile(MessageFile):
-    """Bag of ROS messages with the interface of an MCAP file (log of messages).
+    """Bag of ROS messages that can be read like an MCAP file (log of messages).
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ class RosbagFile(MessageFile):
         self._bag.close()
 
     def message(self, number: int) -> bytes:
-        """Return the bytes of a message in CDR, by its number.
+        """Return the bytes of the message with a number, in CDR.
 
         Raises
         ------
@@ -111,7 +111,7 @@ class RosbagFile(MessageFile):
         keep: Callable[[int], bool] | None = None,
         rank: Callable[[int], int] | None = None,
     ) -> Iterator[Messages]:
-        """Yield all messages in order of log time, then of the rank of their channels, then of topic."""
+        """Yield all messages sorted by log time, then by rank of the channel, then by topic."""
         del keep
         for reason in self._losses:
             report.lose(Loss(reason, bytes=0))
@@ -130,7 +130,7 @@ class RosbagFile(MessageFile):
             yield held_messages(held, log_times, channel=channel[rows].tolist(), sequence=rows)
 
     def _readable(self, rows: list[int], report: Findings) -> Iterator[tuple[int, int, bytes]]:
-        """Yield number, time and bytes of each readable message. Report the others as lost."""
+        """Yield number, time and bytes of each message. Report unreadable messages as lost."""
         for number in rows:
             time_ns = int(self._bag.times[number])
             try:

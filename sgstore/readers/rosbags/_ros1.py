@@ -1,4 +1,4 @@
-"""Reader of ROS 1 bags (format 2.0), record by record. It also reads damaged bags and bags without an index.
+"""Reader of ROS 1 bags (format 2.0), record by record. Bags may be damaged or lack an index.
 
 Source: ROS wiki, "Bags/Format/2.0".
 """
@@ -32,7 +32,7 @@ _FAULTS: Final = (ValueError, OSError, EOFError, RuntimeError, struct.error, Mem
 
 
 class Ros1Bag:
-    """Messages of a bag of ROS 1, in the order of the file.
+    """Messages of a ROS 1 bag, in the order of the file.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ class Ros1Bag:
         self.channel, self.times = told[:, 0], told[:, 1]
 
     def _index(self, lose: Callable[[str], None]) -> list[tuple[int, int]]:
-        """Find all topics and messages, and return topic and time of each message."""
+        """Find all topics and messages. Return topic and time of each message."""
         columns: list[tuple[int, int]] = []
         numbers: dict[int, int] = {}
         odd = 0
@@ -113,7 +113,7 @@ class Ros1Bag:
     def _records(
         self, lose: Callable[[str], None]
     ) -> Iterator[tuple[int, dict[str, bytes], int, int]]:
-        """Yield chunk, header, position and length of the data of all messages and connections."""
+        """Yield for each message and connection: chunk, header, position and length of the data."""
         for header, place, length in _records_of(self._file, lose):
             if header.get("op") != bytes([_CHUNK]):
                 yield -1, header, place, length
@@ -129,7 +129,7 @@ class Ros1Bag:
             self._file.seek(place + length)
 
     def _read_chunk(self, at: int) -> bytes:
-        """Return the decompressed content of the chunk at a position."""
+        """Return the decompressed content of the chunk at a file position."""
         self._file.seek(at)
         header = _header(self._file)
         (length,) = _LENGTH.unpack(self._file.read(4))
@@ -151,7 +151,7 @@ class Ros1Bag:
 def _records_of(
     file: BufferedReader, lose: Callable[[str], None]
 ) -> Iterator[tuple[dict[str, bytes], int, int]]:
-    """Yield header, position and length of the records outside chunks."""
+    """Yield for each record outside chunks: header, position and length."""
     file.seek(0, 2)
     end = file.tell()
     at = len(MAGIC)
@@ -175,7 +175,7 @@ def _records_of(
 def _records_in(
     content: bytes, lose: Callable[[str], None]
 ) -> Iterator[tuple[dict[str, bytes], int, int]]:
-    """Yield header, position and length of the records in a chunk."""
+    """Yield for each record in a chunk: header, position and length."""
     at = 0
     while at < len(content):
         try:
@@ -202,7 +202,7 @@ def _header(file: BufferedReader) -> dict[str, bytes]:
 
 
 def _fields(data: bytes, length: int) -> dict[str, bytes]:
-    """Return the fields of a record header by name. The entry ``raw`` is the header itself."""
+    """Return the fields of a record header by name. Entry ``raw`` is the whole header."""
     if len(data) != length:
         raise ValueError("a header is cut off")
     told, at = {"raw": data}, 0

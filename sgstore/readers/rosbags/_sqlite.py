@@ -1,4 +1,4 @@
-"""Reader of rosbag2's SQLite files (``.db3``), also if the files or the messages are compressed.
+"""Reader of rosbag2's SQLite files (``.db3``). Files and messages may be compressed.
 
 Source: rosbag2, ``rosbag2_storage_sqlite3/README.md`` (tables of all versions of the schema).
 """
@@ -164,7 +164,7 @@ class SqliteBag:
 def _rows(
     connection: sqlite3.Connection, columns: str, table: str, torn: list[str]
 ) -> Iterator[tuple[Any, ...]]:
-    """Yield the readable rows of a table in order of their numbers. Add the faults to ``torn``."""
+    """Yield the readable rows of a table in order of row number. Append faults to ``torn``."""
     start = 0
     while len(torn) < MAX_TORN:
         query = f"SELECT rowid, {columns} FROM {table} WHERE rowid >= ? ORDER BY rowid"  # noqa: S608
@@ -184,7 +184,7 @@ def _rows(
 
 
 def _next_readable(connection: sqlite3.Connection, table: str, start: int) -> int:
-    """Return the first row number after a damaged part at which rows are readable again, or -1."""
+    """Return the number of the first readable row after a damaged part; -1 without one."""
 
     def fails(number: int) -> bool:
         query = f"SELECT rowid FROM {table} WHERE rowid >= ? ORDER BY rowid LIMIT 1"  # noqa: S608

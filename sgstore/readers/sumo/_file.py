@@ -1,4 +1,4 @@
-"""SUMO floating-car data with the interface of an MCAP file: one message per time step.
+"""SUMO floating-car data, read like an MCAP file: one message per time step.
 
 The file is one XML document of any length, plain or gzip-compressed. It is read in pieces and split at the
 start and end of each time step. The contents of a step are parsed later. A step above the size limit, or bytes
@@ -65,7 +65,7 @@ def opened(path: Path) -> BufferedIOBase:
 
 
 def parse(path: Path, start: Callable[[str, dict[str, str], int], None], what: str) -> None:
-    """Read the XML elements of a SUMO file. ``start`` gets tag, attributes and depth of each element.
+    """Read the XML elements of a SUMO file. Call ``start`` with tag, attributes and depth of each.
 
     Raises
     ------
@@ -83,7 +83,7 @@ def parse(path: Path, start: Callable[[str, dict[str, str], int], None], what: s
 
 
 class _Unpacked(gzip.GzipFile):
-    """Gzip file that also closes the underlying compressed file."""
+    """Gzip file. Closing it also closes the compressed file below."""
 
     def __init__(self, file: BufferedIOBase) -> None:
         super().__init__(fileobj=file, mode="rb")
@@ -113,7 +113,7 @@ def seconds_of(text: str | None) -> float:
 
 
 class SumoFile(MessageFile):
-    """SUMO floating-car data with the interface of an MCAP file (log of messages).
+    """SUMO floating-car data that can be read like an MCAP file (log of messages).
 
     Parameters
     ----------
@@ -158,7 +158,7 @@ class SumoFile(MessageFile):
         yield from numbered_runs(self._timed(report), _CHANNEL)
 
     def _timed(self, report: Findings) -> Iterator[tuple[int, int, bytes]]:
-        """Yield position, time and bytes of each time step that has a time."""
+        """Yield position, time and bytes of each time step. Time steps without a time are lost."""
         for place, data in _steps(self._file, report):
             time = time_ns(data)
             if time is None or time < 0:
@@ -168,7 +168,7 @@ class SumoFile(MessageFile):
 
 
 def read_messages(path: Path, places: Iterable[tuple[int, int, int]]) -> Iterator[bytes]:
-    """Yield the bytes of time steps of a SUMO file, by their offsets and lengths.
+    """Yield the bytes of time steps in a SUMO file, given by offset and length.
 
     See :meth:`SumoFile.walk`.
 
@@ -191,7 +191,7 @@ def read_messages(path: Path, places: Iterable[tuple[int, int, int]]) -> Iterato
 
 
 def _pieces(file: BufferedIOBase, report: Findings) -> Iterator[bytes]:
-    """Yield the bytes of a SUMO file in pieces. An empty piece marks the end of an undamaged file."""
+    """Yield the bytes of a SUMO file in pieces. After an undamaged file, the last piece is empty."""
     while True:
         try:
             piece = file.read1(_PIECE)
@@ -204,7 +204,7 @@ def _pieces(file: BufferedIOBase, report: Findings) -> Iterator[bytes]:
 
 
 def _steps(file: BufferedIOBase, report: Findings) -> Iterator[tuple[int, bytes]]:
-    """Yield position and bytes of each SUMO time step, from its start tag to its end tag."""
+    """Yield position and bytes of each SUMO time step, from start tag to end tag."""
     file.seek(0)
     rest, place = b"", 0  # Unused bytes, and their position in the file.
     for piece in _pieces(file, report):

@@ -34,7 +34,7 @@ _STATES: Final = {
 
 
 def lights_beside(path: Path) -> Path | None:
-    """Return the path of the SUMO file with light states next to a recording, or ``None``.
+    """Return the path of the SUMO file with light states next to a recording; ``None`` if it does not exist.
 
     For ``drive.fcd.xml``, this is ``drive.tls.xml``.
     """
@@ -42,7 +42,7 @@ def lights_beside(path: Path) -> Path | None:
 
 
 def file_beside(path: Path, kind: str) -> Path | None:
-    """Return the path of the SUMO file of a kind next to a recording, or ``None``."""
+    """Return the path of a SUMO file of a given kind next to a recording; ``None`` if it does not exist."""
     name = path.name
     for ending in (*ENDINGS, ".fcd"):
         if name.lower().endswith(ending):
@@ -89,7 +89,7 @@ class LightStates:
         known.append(state)
 
     def of(self, signal: str, time_ns: int) -> str | None:
-        """Return the state of a traffic light (map signal) at a time; ``None`` means unknown."""
+        """Return the state of a traffic light (map signal) at a time; ``None`` if unknown."""
         name, link = signal, 0
         if name not in self._times:
             name, _, number = signal.rpartition("/")

@@ -65,7 +65,7 @@ _SPECIAL: Final = (("emergency", "emergency"), ("police", "emergency"), ("taxi",
 
 
 def meaning_of(type_name: str, *, walks: bool) -> TypeMeaning:
-    """Return the kind of a SUMO vehicle type: for a known type name, otherwise from words in the name."""
+    """Return the kind of a SUMO vehicle type, from its known name or else from words in the name."""
     name = type_name.lower().partition("@")[0]
     known = type_meanings().get(name)
     if known is not None:
@@ -78,7 +78,7 @@ def meaning_of(type_name: str, *, walks: bool) -> TypeMeaning:
 
 
 class SumoTrace(FramesTrace):
-    """Open SUMO recording, which yields frames. Without the argument ``ego``, the frames have no ego."""
+    """Open SUMO recording, which yields frames. They have no ego unless ``ego`` is given."""
 
     name: ClassVar[str] = "sumo"
 
@@ -98,7 +98,7 @@ class SumoTrace(FramesTrace):
         self._guessed: set[str] = set()
 
     def decoder(self, report: TraceReport) -> Any:
-        """Return a new decoder of frames, and report vehicle types without a size."""
+        """Return a new decoder of frames. Report vehicle types without a size."""
         found = super().decoder(report)
         self._warnings = report.warnings
         return found
@@ -146,7 +146,7 @@ class SumoTrace(FramesTrace):
 
 
 class _TimeStep:
-    """Handler of XML parser events that adds SUMO vehicles, persons and containers to a frame.
+    """Handler of XML parser events. It adds SUMO vehicles, persons and containers to a frame.
 
     SUMO may have a vehicle and a person with the same name. ``owners``: the first element with each name.
     """
@@ -209,7 +209,7 @@ class _TimeStep:
 
 
 def _lights(told: dict[str, str]) -> list[str] | None:
-    """Return the names of a SUMO vehicle's active lights. ``None`` means unknown."""
+    """Return the names of the lights that a SUMO vehicle has on; ``None`` if unknown."""
     if "signals" not in told:
         return None
     mask = int(told["signals"])

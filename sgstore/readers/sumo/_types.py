@@ -1,4 +1,4 @@
-"""Vehicle types of SUMO (sizes and classes) from the route file next to a recording.
+"""Vehicle types of SUMO (sizes and classes), from the route file next to a recording.
 
 Source: SUMO documentation, "Definition of Vehicles, Vehicle Types, and Routes" (Eclipse, EPL-2.0).
 """
@@ -21,14 +21,14 @@ _SIZES: Final = ("length", "width", "height")
 
 
 class VehicleType(NamedTuple):
-    """Vehicle type of SUMO: its class, such as ``passenger``, and its known sizes; m."""
+    """Vehicle type of SUMO: its class (such as ``passenger``) and its known sizes; m."""
 
     vehicle_class: str
     sizes: dict[str, float]
 
 
 def types_beside(path: Path) -> list[Path]:
-    """Return the paths of the SUMO files with vehicle types next to a recording.
+    """Return the paths of SUMO files with vehicle types next to a recording.
 
     For ``drive.fcd.xml``, these are ``drive.rou.xml`` and ``drive.add.xml``.
     """
