@@ -161,7 +161,7 @@ class Interval:
 
 
 class Matches(Tabular):
-    """Matches of a query. Iteration yields rows; each call runs a new search.
+    """Matches of a query. Iteration yields rows. Each call of a method runs a new search.
 
     ``count``, ``frames`` and ``clips`` cover all matching frames; ``RETURN`` has no effect on them. With
     ``LIMIT``, they cover the frames of the listed rows.
@@ -315,7 +315,7 @@ class Matches(Tabular):
 
     @contextmanager
     def _compiled(self) -> Generator[Compiled]:
-        """Yield the query compiled for the current store. Inside the block, the store cannot change.
+        """Yield the query, compiled for the current store. The store cannot change inside the ``with`` block.
 
         The content of a store affects the SQL, so a change of the file requires a new compilation.
         """
@@ -339,7 +339,7 @@ class Matches(Tabular):
 
     @property
     def mistakes(self) -> tuple[str, ...]:
-        """Notes among :attr:`notes` that need no second search if the query has no matches.
+        """The subset of :attr:`notes` that a query without matches gets without a second search.
 
         Examples
         --------
@@ -366,7 +366,7 @@ class Matches(Tabular):
         return absent_part(compiled.bound, partial(self._exists, compiled))
 
     def _exists(self, compiled: Compiled, scope: Scope) -> bool:
-        """Return True if some frame of the searched traces matches a pattern."""
+        """True if at least one frame of the searched traces matches a pattern."""
         query = replace(compiled.bound, scope=scope, result=Result(limit=1), steps=(), stages=())
         ready = replace(compiled, bound=query, query=rewritten(query, compiled.catalog))
         apart = copy.copy(self)
@@ -411,7 +411,7 @@ class Matches(Tabular):
         return about
 
     def _settings(self) -> tuple[str, dict[str, object]]:
-        """Return the settings of the query as text, and the values of their parameters."""
+        """Return the ``USING`` clauses of the query as text, and the values of the query parameters in them."""
         from sgstore.lang.syntax import parse
 
         settings = [one for part in parse(self._text) for one in getattr(part, "settings", ())]
@@ -452,7 +452,7 @@ class Matches(Tabular):
         return self._kept[1]
 
     def __len__(self) -> int:
-        """Return the number of rows, each match in each frame; see :meth:`count` for frames.
+        """Return the number of rows: one for each match in each frame. To count frames, see :meth:`count`.
 
         Rows of a small result are kept until the store changes, so that they are not searched twice. ``list``
         asks for the number after it has created its iterator, which then takes the rows of any result.
@@ -478,7 +478,7 @@ class Matches(Tabular):
     @overload
     def __getitem__(self, place: slice) -> list[Row]: ...
     def __getitem__(self, place: int | slice) -> Row | list[Row]:
-        """Return the row at an index, or the rows of a slice, as of a list."""
+        """Return one row, given its index; or several rows, given a slice. Works as for a list."""
         if isinstance(place, int):
             return (self.rows() if place < 0 else self.head(place + 1))[place]
         if place.stop is None or min(place.start or 0, place.stop, place.step or 1) < 0:
@@ -575,7 +575,7 @@ class Matches(Tabular):
         return [{n: row[i] for i, n in names.items() if row[i] is not None} for row in found]
 
     def parts(self, frame: FrameRef, binding: Mapping[str, int] | None = None) -> TruthLanes:
-        """Return the frames in which each part of the pattern is true, for one binding.
+        """Return, for one binding, the frames in which each part of the pattern is true.
 
         See :meth:`sgstore.Store.parts`.
 
@@ -680,7 +680,7 @@ class Matches(Tabular):
 
     @property
     def lists(self) -> Literal["matches", "chosen", "values"]:
-        """Content of the rows: all matches, chosen or ordered matches, or values of several matches.
+        """Kind of the rows: all matches, some or sorted matches, or values computed from several matches.
 
         Examples
         --------
@@ -694,7 +694,7 @@ class Matches(Tabular):
         return "chosen" if chosen or result.form == "intervals" else "matches"
 
     def listed(self) -> Iterator[Interval]:
-        """Yield the match of each row, in the order of the rows, with its binding and the values of ``RETURN``.
+        """Yield the match behind each row, in row order, with its binding and its ``RETURN`` values.
 
         A row of a single frame gives an interval of one frame. Nothing is yielded for clips, and if
         :attr:`lists` is ``values``.
@@ -834,7 +834,7 @@ class Matches(Tabular):
                             return
 
     def as_table(self, name: str, *, apart: bool = False) -> list[Given]:
-        """Return the SQL steps that create a temporary table with all rows.
+        """Return the SQL statements that create a temporary table with all rows of the result.
 
         ``apart``: add columns that distinguish equal node ids of different traces.
 
@@ -870,7 +870,7 @@ class Matches(Tabular):
             return compiled.stages()
 
     def for_people(self) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
-        """Return columns and rows in readable form; see :func:`sgstore.lang.sql.for_people`."""
+        """Return columns and rows in a short form for display; see :func:`sgstore.lang.sql.for_people`."""
         return for_people(self.columns, self, graphs=self.graphs)
 
     def _columns_of(self, compiled: Compiled, form: str) -> tuple[str, ...]:
@@ -879,7 +879,7 @@ class Matches(Tabular):
     def _answered(
         self, form: str, offsets: tuple[int, int] = (0, 0), *, whole: bool = False
     ) -> Iterator[tuple[Any, ...]]:
-        """Run the query, and yield its rows in one form: rows, frames, subgraphs, intervals, bound, clips."""
+        """Run the query. Yield its rows as one of: rows, frames, subgraphs, intervals, bound, clips."""
         with self._compiled() as compiled:
             match form:
                 case "rows":
@@ -907,7 +907,7 @@ class Matches(Tabular):
         *,
         whole: bool = False,
     ) -> Iterator[tuple[Any, ...]]:
-        """Yield the rows of a statement, window by window. All windows read the same state of the store.
+        """Run an SQL statement for one window of frames after another, and yield its rows.
 
         ``form`` is the form of the statement: rows, intervals, clips or frames. ``None`` means the form of the
         query; order and limit apply only to this form. ``whole``: the caller reads all rows.
@@ -935,7 +935,7 @@ class Matches(Tabular):
         *,
         whole: bool = False,
     ) -> Iterator[tuple[SqlStatement, Windows]]:
-        """Yield a statement for each window. The caller must add its number of rows to ``Windows.rows``."""
+        """Yield the SQL statement of each window. The caller adds the row count to ``Windows.rows``."""
         result, form = compiled.query.result, form or compiled.query.result.form
         at_once = form == result.form and not compiled.in_windows
         windows = Windows(
@@ -948,7 +948,7 @@ class Matches(Tabular):
                 yield one, windows
 
     def _asked(self, statement: SqlStatement) -> dict[str, Any]:
-        """Return the arguments for a query of :class:`StoreFile`: the last SQL step and its temporary tables.
+        """Return the arguments with which :class:`StoreFile` runs a statement and makes its temporary tables.
 
         The tables are external matches, and results of earlier steps.
         """
@@ -972,7 +972,7 @@ _INTERVALS: Final = {"intervals": Compiled.intervals, "bound": Compiled.bound_in
 
 
 class UnionMatches(Matches):
-    """Combined matches of the parts of a ``UNION`` or ``UNION ALL`` query.
+    """Matches of a ``UNION`` or ``UNION ALL`` query, combined from the matches of its single queries.
 
     Rows of frames, intervals or clips are ordered by trace and time, or part by part if a part has ``ORDER
     BY``. Other rows are ordered by value (``UNION``) or part by part (``UNION ALL``).
@@ -1022,7 +1022,7 @@ class UnionMatches(Matches):
 
     @property
     def scope(self) -> dict[str, Any]:
-        """Data that the settings excluded from the traces that any part searches."""
+        """Data that the settings excluded from the traces that the single queries of the union search."""
         ready = [part._ready for part in self._parts]  # noqa: SLF001
         chosen = {trace.trace_id for one in ready for trace in one.chosen}
         traces = (one for one in self._file.traces() if one.trace_id in chosen)
@@ -1030,7 +1030,7 @@ class UnionMatches(Matches):
 
     @property
     def reasons(self) -> dict[str, str]:
-        """Reasons of all parts for the skipped traces in :attr:`left_out`: trace name → reasons."""
+        """Reasons for the skipped traces of all single queries: trace name → reasons."""
         found: dict[str, list[str]] = {}
         for part in self._parts:
             for name, reason in part.reasons.items():
@@ -1039,16 +1039,16 @@ class UnionMatches(Matches):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes on likely mistakes in any part of the query."""
+        """Notes on likely mistakes in any single query of the union."""
         return tuple(dict.fromkeys(note for part in self._parts for note in part.notes))
 
     @property
     def mistakes(self) -> tuple[str, ...]:
-        """Notes of all parts that need no second search."""
+        """Notes of all single queries that need no second search if the query has no matches."""
         return tuple(dict.fromkeys(note for part in self._parts for note in part.mistakes))
 
     def nearest(self) -> dict[str, Any]:
-        """Return the frame that comes nearest to the first part of the union without matches."""
+        """Return the frame that comes closest to the first single query without matches."""
         return next(filter(None, (part.nearest() for part in self._parts)), {})
 
     def _rows(self, *, whole: bool) -> Iterator[Row]:
@@ -1069,7 +1069,7 @@ class UnionMatches(Matches):
     def _merged(
         self, parts: Sequence[Iterable[T]], key: Callable[[T], Any], told: Callable[[T], object]
     ) -> Iterator[T]:
-        """Merge the sorted results of the parts. For a ``UNION``, yield equal results once."""
+        """Merge the sorted results of the single queries. For a ``UNION``, yield equal results only once."""
         last: Any = None
         seen: set[object] = set()
         for one in merge(*parts, key=key):
@@ -1081,7 +1081,7 @@ class UnionMatches(Matches):
             yield one
 
     def _joined(self) -> dict[str, Any]:
-        """Return the arguments for a query of :class:`StoreFile` for all rows of the union.
+        """Return the arguments with which a :class:`StoreFile` selects all rows of the union.
 
         Each part becomes a temporary table.
         """
@@ -1099,7 +1099,7 @@ class UnionMatches(Matches):
         return sum(1 for _ in self.frames())
 
     def frames(self) -> Iterator[FrameRef]:
-        """Yield the matching frames of all parts once, ordered by trace name and frame number."""
+        """Yield the matching frames of all single queries by trace and number, without duplicates."""
 
         def key(frame: FrameRef) -> tuple[Any, int]:
             return natural(frame.trace), frame.seq
@@ -1116,17 +1116,17 @@ class UnionMatches(Matches):
                     yield frame
 
     def bindings(self, frame: FrameRef) -> list[dict[str, int]]:
-        """Return the bindings of all parts in one frame: variable name → node id. ``RETURN`` has no effect."""
+        """Return the bindings of all single queries in one frame: variable name → node id."""
         return [binding for part in self._parts for binding in part.bindings(frame)]
 
     def subgraphs(self) -> Iterator[nx.MultiDiGraph[int]]:
-        """Yield each match of each part as a graph; see :meth:`Matches.subgraphs`."""
+        """Yield each match of each single query as a graph; see :meth:`Matches.subgraphs`."""
         with self._file.snapshot():
             parts = [part.subgraphs() for part in self._parts]
             yield from merge(*parts, key=lambda of: (natural(of.graph["trace"]), of.graph["seq"]))
 
     def parts(self, frame: FrameRef, binding: Mapping[str, int] | None = None) -> TruthLanes:
-        """Return the truth lanes of the first part that matches the frame with this binding.
+        """Return the truth lanes of the first single query that matches the frame with this binding.
 
         Default: the first part.
         """
@@ -1138,28 +1138,28 @@ class UnionMatches(Matches):
         return next(matching, named[0]).parts(frame, binding)
 
     def parts_each(self, matches: Sequence[tuple[str, int, Mapping[str, int]]]) -> list[TruthLanes]:
-        """Return the truth lanes of matches, each of the part that :meth:`parts` chooses."""
+        """Return the truth lanes of each match. Its single query is chosen as in :meth:`parts`."""
         frames = ((self._file.frame(f"{trace}#{seq}"), given) for trace, seq, given in matches)
         return [self.parts(*one) for one in frames]
 
     def intervals(self, *, bound: bool = False) -> Iterator[Interval]:
-        """Yield the intervals of all parts, ordered by trace and start; see :meth:`Matches.intervals`."""
+        """Yield the intervals of all single queries by trace and start; see :meth:`Matches.intervals`."""
         with self._file.snapshot():
             parts = [self._in_time(part.intervals(bound=bound), _begin) for part in self._parts]
             yield from self._merged(parts, _begin, repr)
 
     @property
     def lists(self) -> Literal["matches", "chosen", "values"]:
-        """Content of the rows: all matches; or values, if a part chooses, orders or groups its matches."""
+        """Kind of the rows: all matches; or values, if a single query limits, sorts or groups its matches."""
         plain = self._limit is None and all(part.lists == "matches" for part in self._parts)
         return "matches" if plain else "values"
 
     def listed(self) -> Iterator[Interval]:
-        """Yield the matches of all parts, ordered by trace and start, unless :attr:`lists` is ``values``."""
+        """Yield the matches of all single queries by trace and start; none if :attr:`lists` is ``values``."""
         yield from self.intervals(bound=True) if self.lists == "matches" else ()
 
     def clips(self, before: float = 0.0, after: float = 0.0) -> Iterator[Clip]:
-        """Yield clips around the matching frames of all parts, in log time. Overlapping clips are merged."""
+        """Yield clips around the matching frames of all single queries. Overlapping clips are merged."""
         with self._file.snapshot():
             parts = [part.clips(before, after) for part in self._parts]
             found = merge(*parts, key=lambda clip: (natural(clip.trace), clip.start_ns))
@@ -1183,7 +1183,7 @@ class UnionMatches(Matches):
         yield from ()
 
     def as_table(self, name: str, *, apart: bool = False) -> list[Given]:
-        """Return the steps that create a temporary table of all rows; see :meth:`Matches.as_table`."""
+        """Return the SQL statements that create a table of all rows; see :meth:`Matches.as_table`."""
         if self.graphs:
             return self._parts[0].as_table(name, apart=apart)  # which raises an error
         asked = self._joined()
@@ -1191,7 +1191,7 @@ class UnionMatches(Matches):
         return [*asked["given"], (made, asked["parameters"])]
 
     def explain(self) -> str:
-        """Explain each part of the query, stage by stage."""
+        """Explain each single query of the union, stage by stage."""
         word = "UNION" if self._distinct else "UNION ALL"
         return f"\n\n==== {word}\n\n".join(part.explain() for part in self._parts)
 
@@ -1222,7 +1222,7 @@ class _LazyRows:
         return next(self._rows)
 
     def take(self, rows: Iterable[Row]) -> int | None:
-        """Use the rows of another search, if this search has not started. Return their number, or None."""
+        """Take over the rows of another search, unless this search has started. Return their number or None."""
         if self._rows is not None:
             return None
         found = list(rows)
@@ -1236,13 +1236,13 @@ class TooMuchError(QueryError):
 
 @lru_cache(maxsize=64)
 def row_type(columns: tuple[str, ...]) -> Any:
-    """Return a named tuple class for rows. Columns with an invalid field name get a numbered name."""
+    """Return a named tuple class for rows. Columns that are not valid field names get the name ``_N``."""
     names = [re.sub(r"\W+", "_", name).strip("_") for name in columns]
     return namedtuple("Row", names, rename=True)  # pyright: ignore[reportUntypedNamedTuple]
 
 
 class Windows:
-    """Iterator over ranges of buckets, for a search through one trace after another.
+    """Iterator over ranges of buckets (64 frames each), so that a search reads one trace after another.
 
     A small store yields only ``None``: all buckets.
 
@@ -1294,7 +1294,7 @@ class Windows:
             yield from self._told(group, used)
 
     def parts(self, window: Window | None, ask: Callable[[Window | None], T]) -> Iterator[T]:
-        """Yield the result of ``ask`` for a range. If it is too large, divide the range in two and repeat.
+        """Call ``ask`` for a range of frames, and yield the result. A range with too many rows is halved.
 
         Raises
         ------
@@ -1333,7 +1333,7 @@ class Windows:
 def _rows_within(
     rows: Iterable[tuple[Any, ...]], intervals: Iterable[Interval]
 ) -> Iterator[tuple[Any, ...]]:
-    """Yield the rows of frames that lie in one of some intervals."""
+    """Yield the rows whose frame lies in one of the given intervals."""
     spans = defaultdict[str, list[tuple[int, int]]](list)
     for trace, start, end in sorted((one.trace, one.start_seq, one.end_seq) for one in intervals):
         known = spans[trace]
@@ -1351,7 +1351,7 @@ def _rows_within(
 def intervals_for_people(
     intervals: Iterable[Interval],
 ) -> tuple[tuple[str, ...], Iterator[tuple[Any, ...]]]:
-    """Return readable columns and rows of intervals, with the first frame as ``trace#seq`` and names of nodes.
+    """Return intervals in a form for display: column names, and rows with frame names and node names.
 
     Returns
     -------
@@ -1385,7 +1385,7 @@ def notes_in(
     query: str,
     parameters: Mapping[str, object],
 ) -> tuple[str, ...]:
-    """Return notes on query texts that the store does not contain; see :func:`sgstore.lang.help.notes_on`."""
+    """Return notes on texts in a query that no stored value equals; see :func:`sgstore.lang.help.notes_on`."""
     from sgstore.lang.help import notes_on
 
     return notes_on(compared, query, parameters, lambda sql, values: file.rows(sql, values).values)

@@ -83,7 +83,7 @@ class StoreFrame:
         return tuple(topic for (topic,) in self._store.file.rows(sql, [self.ref.frame_id]))
 
     def graph(self, abstraction: str | None = None) -> nx.MultiDiGraph[Any]:
-        """Return the scene graph of the frame, or its form in an abstraction; see :meth:`Store.graph`.
+        """Return the frame's scene graph, or an abstraction of it such as ``RSV``; see :meth:`Store.graph`.
 
         Examples
         --------
@@ -183,7 +183,7 @@ class ClipAnimation:
 
 
 class StoreVerbs:
-    """Methods that a store and a collection share, named as the commands of the command line.
+    """Methods that a store and a collection share. Each has the name of a command of the command line.
 
     The signatures and docstrings are the table of verbs: the command line and the tools of assistants take
     names, defaults and help of their options from here.
@@ -193,7 +193,7 @@ class StoreVerbs:
     """
 
     def _run(self, verb: str, given: dict[str, Any]) -> Any:
-        """Run the function of a command with the arguments of a method."""
+        """Run a command's function with the arguments of the method of the same name."""
         store = given.pop("self")
         return VERBS.load(verb)(store, **given)
 
@@ -531,7 +531,7 @@ class StoreVerbs:
         to: str | Path | None = None,
         parameters: Mapping[str, object] | None = None,
     ) -> Any:
-        """Return matches and rule violations over time for each trace: one lane for each entity.
+        """Return the times of matches and rule violations in each trace, in one row for each entity.
 
         Parameters
         ----------
@@ -928,7 +928,7 @@ class Store(StoreVerbs):
         return ingest(self.file.path, files, **options)
 
     def only(self, *traces: str) -> Self:
-        """Return the store with some of its traces: :meth:`find` and :meth:`check` search no others.
+        """Return the store, limited to some of its traces: :meth:`find` and :meth:`check` search only these.
 
         Parameters
         ----------
@@ -1099,7 +1099,7 @@ class Store(StoreVerbs):
     def graph(self, frame: int | str | FrameRef, abstraction: str) -> nx.MultiDiGraph[str]: ...
 
     def graph(self, frame: int | str | FrameRef, abstraction: str | None = None) -> Any:
-        """Return the scene graph of a frame, or its form in an abstraction.
+        """Return the scene graph of a frame, or an abstraction of it such as ``RSV``.
 
         Parameters
         ----------
@@ -1193,7 +1193,7 @@ class Store(StoreVerbs):
         limit: int = 10,
         each_trace: bool = False,
     ) -> list[SimilarFrames]:
-        """Return runs of frames similar to an example: first frames of its class, then the most similar.
+        """Return runs of frames that are similar to the given frame: those with an equal graph first.
 
         Two frames are compared by their graphs in an abstraction, as multisets of nodes by label and of edges
         by the labels of edge and ends, with the weighted Jaccard index. Each result lists the shared and the
@@ -1231,7 +1231,7 @@ class Store(StoreVerbs):
         return Example.find(self.file, example, limit, each_trace=each_trace)
 
     def pattern(self, frame: int | str | FrameRef, *, ignore: Sequence[str] = ()) -> str:
-        """Return a pattern that describes the surroundings of the ego in a frame, and that matches this frame.
+        """Return a pattern that describes the surroundings of the ego in a frame. It matches this frame.
 
         Parameters
         ----------
@@ -1514,7 +1514,7 @@ class Store(StoreVerbs):
     def why_not(
         self, frame: int | str | FrameRef, text: str, /, **parameters: object
     ) -> WhyNot | WhyNotSteps:
-        """Explain why a pattern does not match a frame: the first false condition, and how much it fails by.
+        """Explain why a pattern does not match a frame: its first false condition, and how far it is from true.
 
         Parameters
         ----------
@@ -1576,7 +1576,7 @@ class Store(StoreVerbs):
         /,
         **parameters: object,
     ) -> TruthLanes:
-        """Return the frames in which each part of a pattern is true, over the whole trace, for one binding.
+        """Return, for one binding, the frames of a trace in which each part of a pattern is true.
 
         The binding matches in the frames in which all parts hold. For a sequence, this applies to each step.
 
@@ -1629,7 +1629,7 @@ class Store(StoreVerbs):
         return found
 
     def _view(self, frame: FrameRef, query: Query) -> FrameView:
-        """Return a frame for evaluation in memory, including the values that the query needs from the store."""
+        """Return a frame for evaluation in memory, with the frame and trace attributes that the query needs."""
         from sgstore.lang.help import events_in, looked_up
         from sgstore.lang.memory import FrameView
         from sgstore.model.world import seconds_of
@@ -1695,7 +1695,7 @@ def matches_of(
 
 
 class UserStatement:
-    """SQL statement of a user in which ``sgql`` patterns are tables.
+    """SQL statement of a user that can use ``sgql`` patterns as tables.
 
     Parameters
     ----------
@@ -1737,7 +1737,7 @@ class UserStatement:
             self._given = lambda: [part for name, of in found for part in of.as_table(name)]
 
     def on(self, file: StoreFile, timeout_s: float | None = None) -> Any:
-        """Return the statement on a store, with the tables of its patterns; see :meth:`StoreFile.user_sql`."""
+        """Prepare the statement for a store, with a table for each pattern; see :meth:`StoreFile.user_sql`."""
         return file.user_sql(self._sql, timeout_s, self._given)
 
 
