@@ -1,4 +1,4 @@
-"""Temporal logic (LTLf with past and time bounds) over recorded traces, or online frame by frame.
+"""Temporal logic: LTLf with past operators and time bounds, on recorded traces or frame by frame.
 
 Both engines return the same results: :func:`evaluate` for all frames of a trace at once, :class:`OnlineFormula`
 frame by frame, as early as possible.

@@ -1,4 +1,4 @@
-"""Truth values of the conditions of a plan in one frame, for many combinations of nodes, as bits."""
+"""Truth values, as bits, of all single-frame conditions of a plan in one frame, for each node combination."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Valuation:
-    """Truth values of the conditions of a plan in the current frame, for all known combinations of nodes.
+    """Truth values of all conditions of a plan in the current frame, for each known combination of nodes.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ class Valuation:
         return letters, self._measure(list(rows), letters, memory)
 
     def _told(self) -> dict[Partial, int]:
-        """Return the single-frame conditions that are true, as bits, for each partial binding.
+        """Return, for each partial binding, the true single-frame conditions as bits of an integer.
 
         A partial binding has nodes for some variables.
         """
@@ -137,7 +137,7 @@ class Valuation:
                     yield self.lattice.placed(key, places)
 
     def _state(self, name: str, rows: list[Partial], letters: Mapping[Partial, int]) -> Column:
-        """Return 0 for each binding with a known value, 1 with an unknown value, NULL with absent entities.
+        """Return, for each binding, 0 if the value is known, 1 if it is unknown, NULL if an entity is absent.
 
         It is masked where an entity is absent.
         """
@@ -161,7 +161,7 @@ class Valuation:
         letters: dict[Partial, int],
         memory: Callable[[Partial], Memory | None],
     ) -> dict[Partial, Memory]:
-        """Evaluate expressions over time: set the bits of true ones, and return the new memory per binding."""
+        """Evaluate expressions over time. Set the bits of true ones; return each binding's new memory."""
         self._courses.step()
         columns: dict[str, Bools] = {}
 

@@ -80,7 +80,7 @@ Duties = tuple["frozenset[Term] | Term | None", ...]
 
 
 class ObligationState:
-    """State of a temporal formula during monitoring: its obligations, and the memory of past operators.
+    """State of a temporal formula during monitoring: its conditions on later frames, and its past values.
 
     An obligation is a condition on later frames.
 
@@ -120,7 +120,7 @@ class ObligationState:
 
     @property
     def ended(self) -> bool:
-        """True if the temporal formula is true when the trace ends now."""
+        """True if the temporal formula is fulfilled when the trace ends at this frame."""
         if self.word in {"broken", "begins"}:
             return self.word == "begins"
         return all(term.ended for term in self._open)
@@ -130,7 +130,7 @@ class ObligationState:
         return [d for duty in self.duties if duty for d in _open(duty)]
 
     def at_end(self, end: str, tick: Tick) -> int:
-        """Return the formula's verdict code if the trace ends now: ``VIOLATED``, ``PENDING``, ``HOLDS``."""
+        """Return the verdict of the formula if the trace ends now: ``VIOLATED``, ``PENDING`` or ``HOLDS``."""
         if self.ended or end == "weak":
             return HOLDS
         due = end == "pending" or (end == "bounded" and all(may_end(t, tick) for t in self._open))
@@ -139,7 +139,7 @@ class ObligationState:
 
 @dataclass(frozen=True, slots=True)
 class ObligationStep:
-    """Result of one frame for a monitored formula: the next state, and violations that begin or end.
+    """Result of one frame for a monitored formula: its next state; if a violation begins, and if one ends.
 
     Attributes
     ----------
@@ -157,7 +157,7 @@ class ObligationStep:
 
 
 class Automaton:
-    """State machine for the formula of a check, with its reset condition and quantifier conditions.
+    """State machine for the formula of a check, its ``RESET`` condition and its quantifier conditions.
 
     Parameters
     ----------
@@ -207,7 +207,7 @@ class Automaton:
         tick: Tick,
         seen: dict[tuple[ObligationState, int], ObligationStep],
     ) -> ObligationStep:
-        """Return the state of the formula after one frame, and the violations that begin or end.
+        """Return the state of the formula after one frame, and if a violation begins or ends there.
 
         Parameters
         ----------
@@ -236,7 +236,7 @@ class Automaton:
         return found
 
     def _until(self, state: ObligationState, tick: Tick) -> tuple[int, int]:
-        """Return the time (ns) and frame number up to which no time bound of the formula starts or ends."""
+        """Return the time (ns) and frame number until which no time bound of the formula begins or ends."""
         bounds = [begun for term in state.terms for begun in term.bounds()]
         for part, (_, entries) in zip(self._progression.past, state.past, strict=True):
             if isinstance(part, Since):
@@ -331,7 +331,7 @@ def _conjuncts(formula: Formula) -> list[Formula]:
 
 
 def _part(formula: Formula) -> tuple[bool, Formula]:
-    """Split off an ``ALWAYS``: return (True, p) for ``ALWAYS p``, otherwise (False, formula).
+    """Return (True, p) for a formula ``ALWAYS p``, otherwise (False, formula).
 
     The split requires a p with bounded future.
     """
@@ -343,7 +343,7 @@ def _part(formula: Formula) -> tuple[bool, Formula]:
 
 @dataclass(frozen=True, slots=True)
 class _CheckEntry:
-    """Monitoring state of a check for one combination of entities (binding).
+    """State of a monitored check for one combination of entities (one binding).
 
     Attributes
     ----------
@@ -373,7 +373,7 @@ class _CheckEntry:
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
-    """Second monitoring state of a binding, in which unknown conditions count as violations.
+    """Second state of a monitored binding. In this state, unknown conditions count as violations.
 
     Attributes
     ----------
@@ -473,7 +473,7 @@ class CheckMonitor:
 
     @property
     def check(self) -> BoundCheck:
-        """Check that is monitored, with resolved names."""
+        """The monitored check, with resolved names."""
         return self._check
 
     @property
@@ -540,7 +540,7 @@ class CheckMonitor:
         letter: int,
         here: FrameTime,
     ) -> Doubt | None:
-        """Return the second state of a binding, in which unknown conditions count against the check, or None.
+        """Return a binding's second state, in which unknown conditions count against the check; or None.
 
         ``None`` means that they change nothing.
         """
@@ -576,7 +576,7 @@ class CheckMonitor:
         self._values.forget((self._pulse.tick.number, *since))
 
     def _values_of(self, key: Partial, span: Span) -> dict[str, Any] | None:
-        """Return the ``RETURN`` values of one violation, or None for one that ``HAVING`` rejects."""
+        """Return the ``RETURN`` values of a violation, or None if its ``HAVING`` condition is false."""
         binding = dict(zip(self._variables, key, strict=True))
         start, end = (one.seq for one in span)
 
@@ -587,7 +587,7 @@ class CheckMonitor:
         return self._returned.told(part)
 
     def _violation(self, key: Partial, span: Span) -> dict[str, Any] | None:
-        """Return the ``RETURN`` values of one violation. Values of an ended violation are stored already."""
+        """Return the ``RETURN`` values of a violation: stored ones if it has ended, otherwise new ones."""
         if not self._check.returns or span not in self._known.of(key).over:
             return self._values_of(key, span)
         wider = ((row, span) for row in self._known.lattice.wider(key))
@@ -596,7 +596,7 @@ class CheckMonitor:
     def _as_sgsm(
         self, entry: _CheckEntry, step: ObligationStep, here: FrameTime, memory: Memory
     ) -> _CheckEntry:
-        """Return the next monitoring state of a combination of entities in SGSM mode.
+        """Return the next state of a monitored combination of entities, for checks in SGSM mode.
 
         In this mode, a violation lasts while the trace must not end.
         """
@@ -644,7 +644,7 @@ class CheckMonitor:
                     yield self._event("violated", here, key, entry.since, entry.since)
 
     def _covered(self, row: Partial, entry: _CheckEntry) -> Iterator[Key]:
-        """Yield the combinations of known entities to which one monitoring state applies."""
+        """Yield the combinations of known entities that share one monitoring state."""
         if None not in row:
             yield row  # type: ignore[misc]
             return
@@ -657,7 +657,7 @@ class CheckMonitor:
                 yield key  # type: ignore[misc]
 
     def _counts(self, key: Key, entry: _CheckEntry) -> bool:
-        """True if the quantifiers of the check include this combination of entities."""
+        """True if the check applies to this combination of entities."""
         if entry.counted != (1 << len(self._guards)) - 1:
             return False
         if any(n not in self._domains[v] for n, v in zip(key, self._variables, strict=True)):
@@ -689,7 +689,7 @@ class CheckMonitor:
 
     @property
     def robustness(self) -> Robustness | None:
-        """Robustness (margin of the verdict) if the trace ended now. ``None`` if it was not requested."""
+        """Robustness (margin of the verdict) if the trace ended now; None if it was not requested."""
         return None if self._margins is None else self._margins.told(self._levels(), self._domains)
 
     def status(self) -> str:
@@ -702,7 +702,7 @@ class CheckMonitor:
         return known
 
     def _worst(self) -> int:
-        """Return the verdict for a trace that ends now if all unknown conditions count against the check."""
+        """Return the verdict if the trace ends now and all unknown conditions count against the check."""
         levels = self._levels(doubted=True)
         codes = [self._code_at_end(self._of(key)) for key in innermost(levels).tolist()]
         return int(folded_values(levels, np.array(codes, np.int8), HOLDS)[0][0])
@@ -711,7 +711,7 @@ class CheckMonitor:
         return self._known.of(tuple(key))
 
     def _levels(self, *, doubted: bool = False, waiting: bool = False) -> list[Level]:
-        """Return the combinations of entities at each quantifier of the check, outermost quantifier first.
+        """Return the combinations of entities for each quantifier of the check, outermost quantifier first.
 
         ``doubted``: use the second evaluation. ``waiting``: add future bindings of ``FORSOME``.
         """
@@ -738,10 +738,7 @@ class CheckMonitor:
         return int(folded_values(levels, codes, CERTAINLY_TRUE)[0][0])
 
     def _spans(self, entry: _CheckEntry, last: FrameTime) -> list[Span]:
-        """Return the violations of one combination of entities at the end of the trace.
-
-        Each one is a pair of first and last frame.
-        """
+        """Return the violations of one entity combination at the trace end: first and last frame of each."""
         found = list(entry.over)
         if entry.since is not None:
             found.append((entry.since, last))
@@ -754,7 +751,7 @@ class CheckMonitor:
         return HOLDS if self._compat else state.at_end(self._check.end, self._pulse.tick)
 
     def _code_at_end(self, entry: _CheckEntry) -> int:
-        """Return the verdict code for one combination of entities at the end of the trace."""
+        """Return the verdict of one combination of entities, as a code, when the trace has ended."""
         own = self._ends(entry.state)
         if entry.since is not None or entry.over or own == VIOLATED:
             return VIOLATED
@@ -810,7 +807,7 @@ class CheckMonitor:
         return waits_for_newcomers(self._check, levels, wider, np.array(codes, np.int8))
 
     def _reason(self, trace: str) -> str:
-        """Return the reason of an unknown verdict as text: the condition, its entities and its frame."""
+        """Return a text that explains an unknown verdict: the unknown condition, its entities and its frame."""
         for key in innermost(self._levels(doubted=True)).tolist():
             entry = self._of(key)
             if entry.doubt is not None and self._code_at_end(entry) == UNKNOWN:
@@ -823,7 +820,7 @@ class CheckMonitor:
     def _at_end(
         self, last: FrameTime, *, holds: bool, bindings: Keys, spans: list[list[Span]]
     ) -> Iterator[MonitorEvent]:
-        """Yield events for violations that are certain only at the end of the trace."""
+        """Yield an event for each violation that is certain only when the trace has ended."""
         if holds:
             return
         if not self._immediate:

@@ -1,4 +1,4 @@
-"""Evaluation plans of checks: formulas with rules for absent entities and unknown values.
+"""Evaluation plans of checks: temporal formulas that define how absences and unknown values count.
 
 A check has two two-valued evaluations: unknown conditions count for the check in the first, and against it in
 the second. In the formula, an unknown condition is a separate proposition. Its name ends in ``+`` for the first
@@ -67,7 +67,7 @@ _CONTRARY: Final = {"+": "-", "-": "+", "": "*", "*": ""}
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """Rules for one part of a formula: if unknown values and absent entities count as true or as false.
+    """Rules for part of a formula: if unknown values count as true, and if absent entities do.
 
     Attributes
     ----------
@@ -101,13 +101,13 @@ CERTAIN: Final = Reading("", absent=False)
 
 
 def base_name(name: str) -> str:
-    """Return the name of a formula's proposition, without the suffix ``+`` or ``-`` for unknown values."""
+    """Return a proposition's name without the suffix ``+`` or ``-``, which defines how unknowns count."""
     return name.rstrip("+-")
 
 
 @dataclass(slots=True)
 class CheckPlan(Plan):
-    """Evaluation plan of a check: its formulas, and the single-frame queries that they need.
+    """Evaluation plan of a check: its temporal formulas, and the single-frame queries that they need.
 
     Attributes
     ----------
@@ -144,7 +144,7 @@ class CheckPlan(Plan):
         return Plan._query(self, things | {ego}, (*where, *near))  # noqa: SLF001 - of the base class
 
     def formula(self, expression: b.Bound) -> f.Formula:
-        """Return the formula for "the condition is known to be true", as needed inside ``run_length``."""
+        """Return the formula of a condition in ``run_length``: true if the condition is known to be true."""
         match expression:
             case b.Operation(word=word, operands=(operand,)) if word == POSSIBLY:
                 return self.read(operand, Reading("*", absent=False))
@@ -152,7 +152,7 @@ class CheckPlan(Plan):
                 return self.read(expression, CERTAIN)
 
     def read(self, expression: b.Bound, reading: Reading) -> f.Formula:
-        """Return the temporal formula of a condition, for given rules on unknown values and absent entities."""
+        """Return the temporal formula of a condition. ``reading`` defines how unknown values count."""
         match expression:
             case b.Tense(word=word, operands=operands):
                 bound = f.Bound(expression.low, expression.high, expression.frames)
@@ -187,7 +187,7 @@ class CheckPlan(Plan):
                 return self.read(found, reading)
 
     def _guarded(self, expression: b.Bound) -> frozenset[str]:
-        """Return the nodes that must be present for a condition to be true, if absence counts as false."""
+        """Return the nodes whose absence makes a condition false."""
         match expression:
             case b.Operation("AND", operands):
                 return frozenset().union(*map(self._guarded, operands))
@@ -197,10 +197,7 @@ class CheckPlan(Plan):
                 return self._things(expression)
 
     def _counted(self, things: frozenset[str], reading: Reading) -> bool | None:
-        """Return the truth value of a condition with an absent entity. ``None`` if quantifiers disagree.
-
-        ``None`` means that it depends on the node.
-        """
+        """If an entity is absent, return the value of the condition; None if it depends on the entity."""
         if reading.absent is not None:
             return reading.absent
         words = {word for word, nodes in self._levels if nodes & things} or {self._levels[0][0]}
@@ -235,7 +232,7 @@ class CheckPlan(Plan):
         return self._joined_here(wanted, counted=counted, reading=reading)
 
     def _joined_here(self, wanted: b.Bound, *, counted: bool, reading: Reading) -> f.Formula:
-        """Return the formula of a single-frame condition whose operands concern different entities."""
+        """Return the formula of a single-frame condition, combined from formulas of its operands."""
         assert isinstance(wanted, b.Operation)  # noqa: S101 - a part of it is no logic
         inner = reading.contrary if counted else reading
         parts = self._merged(wanted.operands) if wanted.word == "AND" else wanted.operands
@@ -252,7 +249,7 @@ class CheckPlan(Plan):
         return self._by_levels(self._asked(expression, things, reading.unknown), things, reading)
 
     def _as_written(self, expression: b.Operation, reading: Reading) -> f.Formula:
-        """Return the formula of a logical operation (``NOT``, ``AND``, …), built from its operands."""
+        """Return the formula of a logical operation such as ``AND``, combined from formulas of its operands."""
         match expression:
             case b.Operation("NOT", (operand,)):
                 return f.Not(self.read(operand, reading.contrary))
@@ -264,7 +261,7 @@ class CheckPlan(Plan):
                 return f.LOGIC[word](*(self.read(one, reading) for one in operands))
 
     def _by_levels(self, found: f.Formula, things: frozenset[str], reading: Reading) -> f.Formula:
-        """Return a formula with the rules for absent entities added, one quantifier after another.
+        """Return a formula extended by rules for absent entities: one rule for each quantifier.
 
         The outermost quantifier has priority.
         """
@@ -277,7 +274,7 @@ class CheckPlan(Plan):
         return found
 
     def _asked(self, wanted: b.Bound, things: frozenset[str], sign: str) -> f.Formula:
-        """Return the proposition that a condition is true, with a second one for unknown values if needed.
+        """Return a formula that is true if a condition is true, and if wanted, also if it is unknown.
 
         If unknown values count as true, it is also true for them.
         """
@@ -292,7 +289,7 @@ class CheckPlan(Plan):
         return f.Or((found, f.Proposition(name + sign.strip("*"))))
 
     def _ask(self, condition: b.Bound, things: frozenset[str]) -> str:
-        """Return the name of the single-frame query for a condition. Add the query to the plan if it is new."""
+        """Return the name of the single-frame query for a condition. A new query is added to the plan."""
         key = unnumbered_text(condition) + f" of {sorted(things)}"
         name = self._names.get(key)
         if name is None:
@@ -304,7 +301,7 @@ class CheckPlan(Plan):
     # Conditions on several frames
 
     def _over_frames(self, expression: b.Bound, reading: Reading) -> f.Formula:
-        """Return the formula of a comparison, or another simple condition, on values of several frames."""
+        """Return the formula of a comparison or similar condition whose value depends on several frames."""
         things = self._things(expression)
         counted = self._counted(things, reading)
         state = self._state(expression)
@@ -332,7 +329,7 @@ class CheckPlan(Plan):
         return name
 
     def _doubtful(self, expression: b.Bound, state: b.Bound) -> b.Bound | None:
-        """Return the condition that a comparison over several frames is unknown. ``None`` means never."""
+        """Return a condition that is true if a comparison over frames is unknown; None if it never is."""
         ways: list[b.Bound] = []
         if any(self._may_be_unknown(part) for part in b.walk(state)):
             ways.append(b.Operation(">", (state, _number(0)), Type.boolean))
@@ -346,12 +343,12 @@ class CheckPlan(Plan):
         return ways[0] if ways else None
 
     def _open_courses(self, expression: b.Bound) -> bool:
-        """True if a condition inside a function over time, such as ``run_length``, may be unknown."""
+        """True if a function over time, such as ``run_length``, contains a condition that may be unknown."""
         parts = (part for part in b.walk(expression) if isinstance(part, b.SignalCall))
         return any(self._open(p.operand) for p in parts if p.word in _OF_CONDITIONS)
 
     def _open(self, condition: b.Bound) -> bool:
-        """True if any value in a condition may be unknown."""
+        """True if a part of a condition may have an unknown value."""
         return any(
             self._unknown(part) is not None
             for part in b.walk(condition)
@@ -373,10 +370,7 @@ class CheckPlan(Plan):
         )
 
     def _state(self, expression: b.Bound) -> b.Bound:
-        """Return the state of an expression: 0 if all of its values are known, otherwise 1 or NULL.
-
-        It is greater if a value is unknown, and NULL if an entity is absent.
-        """
+        """Return an expression for the state of another one: 0 if known, above 0 if unknown, NULL if absent."""
         parts = list(dict.fromkeys(self._states(expression)))
         now = [part for part in parts if isinstance(part, b.Operation) and part.word == STATE]
         rest = self._things(expression) - frozenset().union(*map(self._things, now))
@@ -448,7 +442,7 @@ class CheckPlan(Plan):
                 Plan._measure(self, expression, test)  # noqa: SLF001 - of the base class
 
     def presence(self, node: str) -> str:
-        """Return the name of the single-frame query for the frames in which a node is present."""
+        """Return the name of the single-frame query that finds the frames with a node."""
         found = self.present(node)
         assert isinstance(found, f.Proposition)  # noqa: S101 - it is about a node
         return found.name
@@ -456,7 +450,7 @@ class CheckPlan(Plan):
     # Margins
 
     def quantity(self, expression: b.Bound) -> f.Formula:
-        """Return the formula for the robustness margin of a condition inside ``robustness(…)``."""
+        """Return the formula from which the margin in ``robustness(…)`` is computed."""
         reading = CERTAIN
         while isinstance(expression, b.Operation) and expression.word in {POSSIBLY, IN_FAVOUR}:
             change = {"unknown": "*"} if expression.word == POSSIBLY else {"absent": True}
@@ -467,7 +461,7 @@ class CheckPlan(Plan):
     def margin(  # noqa: PLR0911 - a case each
         self, expression: b.Bound, reading: Reading
     ) -> f.Formula:
-        """Return the formula for a condition's robustness margin.
+        """Return the formula from which a condition's robustness margin is computed.
 
         ``reading`` has the rules for unknown values and absent entities.
         """
@@ -491,7 +485,7 @@ class CheckPlan(Plan):
                 return self.read(expression, reading)
 
     def _margin(self, expression: b.Operation, reading: Reading) -> f.Formula:
-        """Return the formula for a comparison's robustness margin.
+        """Return the formula from which a comparison's robustness margin is computed.
 
         It has defaults for absent and unknown values.
         """
@@ -520,7 +514,7 @@ class CheckPlan(Plan):
     def _differences(
         self, difference: b.Bound, meaning: b.Operation, reading: Reading
     ) -> f.Formula:
-        """Return the formula for the difference of a comparison's sides.
+        """Return the formula for the difference between the two sides of a comparison.
 
         It covers all rules for unknown values in functions over time.
         """
@@ -556,7 +550,7 @@ _OF_CONDITIONS: Final = frozenset({"run_length", "since_true", "robustness"})
 
 
 def _with_possible(expression: b.Bound) -> b.Bound:
-    """Return an expression in which unknown conditions inside functions over time count as true."""
+    """Return a copy of an expression in which functions such as ``run_length`` count unknown as true."""
     match expression:
         case b.SignalCall(word=word, operand=operand) if word in _OF_CONDITIONS:
             return replace(expression, operand=_boolean(POSSIBLY, operand))
@@ -565,7 +559,7 @@ def _with_possible(expression: b.Bound) -> b.Bound:
 
 
 def _in_favour(expression: b.Bound) -> b.Bound:
-    """Return an expression in which ``robustness(…)`` counts conditions on absent entities as true."""
+    """Return a copy of an expression in which ``robustness(…)`` counts absent entities as true."""
     match expression:
         case b.SignalCall(word="robustness", operand=operand):
             return replace(expression, operand=_boolean(IN_FAVOUR, operand))
@@ -576,7 +570,7 @@ def _in_favour(expression: b.Bound) -> b.Bound:
 
 
 def _absence_tried(expression: b.Bound, *, counted: bool) -> b.Bound:
-    """Combine both ways to count absent entities: by ``OR`` if they count as true, otherwise by ``AND``.
+    """Return a condition evaluated in two ways, with absences as false and as true; joined by OR or AND.
 
     If ``counted``, one result must be true, otherwise both.
     """
@@ -599,7 +593,7 @@ def _case(condition: b.Bound, then: b.Bound, otherwise: b.Bound) -> b.Operation:
 
 
 def _contrary(condition: b.Bound) -> b.Bound:
-    """Return the negation of a condition over several frames.
+    """Return the negation of a condition whose value depends on several frames.
 
     It is false too if a number of two entities is missing.
     """
@@ -617,13 +611,13 @@ PlannedCheck = tuple[CheckPlan, f.Formula, "f.Formula | None", dict[int, f.Formu
 
 
 def empty_plan(check: BoundCheck) -> CheckPlan:
-    """Return a new evaluation plan for a check, without queries."""
+    """Return a new evaluation plan for a check. It has no queries yet."""
     words = tuple((q.word if q.absent else "false", frozenset(q.nodes)) for q in check.quantifiers)
     return CheckPlan(query_of_check(check), variables_of(check), words=words, limit=check.limit)
 
 
 def plan_of_check(check: BoundCheck, *, reset: bool = True) -> PlannedCheck:
-    """Return the evaluation plan of a check, its formula, reset condition and quantifier conditions.
+    """Return a check's evaluation plan, its formula, its ``RESET`` condition and its quantifier conditions.
 
     Without ``reset``, the reset condition is None.
     """
@@ -639,11 +633,11 @@ def plan_of_check(check: BoundCheck, *, reset: bool = True) -> PlannedCheck:
 
 
 def plan_of_margins(check: BoundCheck, reading: Reading = WHOLE) -> tuple[CheckPlan, f.Formula]:
-    """Return the evaluation plan for the robustness of a check, and the formula for its margin."""
+    """Return the evaluation plan for the robustness of a check, and the formula that gives its margin."""
     plan = empty_plan(check)
     return plan, plan.margin(check.formula, reading)
 
 
 def misses_absent(check: BoundCheck) -> bool:
-    """True if an absent entity alone can make the check false."""
+    """True if a check can become false only because an entity is absent."""
     return any(one.word == "FORSOME" and one.absent for one in check.quantifiers)

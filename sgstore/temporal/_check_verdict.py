@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Witness:
-    """Entities that decide the verdict of a check. They violate a ``FORALL``, or satisfy a ``FORSOME``.
+    """Entities that decide the verdict of a check: they violate a ``FORALL``, or satisfy a ``FORSOME``.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Witness:
 
 
 def unknown_notes(told: Iterable[tuple[str, str, str]]) -> list[str]:
-    """Return notes on traces with unknown verdicts: one text for each check and reason.
+    """Return notes on traces with an unknown verdict: one text for each check and reason.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ _IN_BRACES: Final = re.compile(r"\{[^{}]*\}")
 
 
 def doubt_text(condition: Bound, who: Sequence[str], frame: str) -> str:
-    """Return the reason of an unknown verdict as text: "condition is unknown of entities in frame"."""
+    """Return a text such as "ego.speed > 3 is unknown of e in town#12", which explains an unknown verdict."""
     written = value_text(condition).removeprefix("(").removesuffix(")")
     while (shorter := _IN_BRACES.sub("\0", written)) != written:
         written = shorter
@@ -82,7 +82,7 @@ def doubt_text(condition: Bound, who: Sequence[str], frame: str) -> str:
 
 
 def absence_text(frames: int) -> str:
-    """Return the text "an entity is absent in N frames" for a verdict."""
+    """Return the text "an entity is absent in N frames"."""
     return f"an entity is absent in {frames} frame{'s' * (frames != 1)}"
 
 
@@ -188,7 +188,7 @@ _MARGIN_COLUMNS: Final = ("robustness", "decided by", "in")
 
 
 def within_range(found: Verdict, short: ShortRange) -> Verdict:
-    """Return the verdict, or ``unknown`` if entities beyond the range of the trace could change it.
+    """Return a verdict; ``unknown`` if entities too far from the ego to be stored could change it.
 
     It becomes unknown if the trace stores too small a range around the ego.
     """
@@ -236,7 +236,7 @@ def verdict_rows(
 
 
 def margin_cells(verdict: Verdict) -> tuple[str, str, str]:
-    """Return table cells for the robustness of a verdict: value, deciding condition with entities, frame.
+    """Return three table cells on the robustness of a verdict: value, deciding condition, deciding frame.
 
     Empty means unknown.
     """
@@ -288,7 +288,7 @@ def verdict_of(
     violations: Callable[[int, Mapping[str, str]], tuple[Interval, ...]],
     last: Interval,
 ) -> Verdict:
-    """Return a verdict with its violations and deciding entities added.
+    """Return a copy of a verdict, completed by its violations and by the entities that decide it.
 
     Witnesses bind the outermost quantifiers of one kind.
 

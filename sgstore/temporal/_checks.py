@@ -246,7 +246,7 @@ class CheckRun:
 
     @property
     def scope(self) -> dict[str, Any]:
-        """Data that the settings excluded from the checked traces; see :func:`sgstore.model.scope.scope_of`.
+        """Data that settings exclude from the checked traces; see :func:`sgstore.model.scope.scope_of`.
 
         Examples
         --------
@@ -282,7 +282,7 @@ class CheckRun:
                 yield from StoreCheck(self._file, one, compat=False, status=False).unknown()
 
     def margins(self) -> Iterator[tuple[Ints, Floats]]:
-        """Yield frame ids and robustness margins of each trace for the only check of the text.
+        """Yield, for each trace, frame ids and robustness margins. The text must have only one check.
 
         See :meth:`StoreCheck.margins`.
 
@@ -428,14 +428,14 @@ class StoreCheck:
 
     @cached_property
     def _premises(self) -> Premises | None:
-        """Premises of a verdict; none if the status of each frame is requested, which needs all data."""
+        """Query sets that limit the needed data; None if the status of each frame is requested."""
         asks = self._plan.asks | self._values.asks
         found = premises_of(self._check, self._plan, self._formula, asks)
         return None if self._want_status else found
 
     @property
     def _narrowing(self) -> Premises | None:
-        """Premises that limit the data to read; none for robustness, which needs the values of all entities."""
+        """Query sets that limit the data to read; None if the robustness of the check is requested."""
         return None if self._check.robustness else self._premises
 
     def readers(
@@ -452,11 +452,11 @@ class StoreCheck:
         yield from traces(*about, gaps=gaps, within=within, premises=premises)
 
     def unknown(self) -> Iterator[Verdict]:
-        """Yield the unknown verdicts of the traces that lack data for the check."""
+        """Yield an unknown verdict for each trace that lacks data for the check."""
         yield from self._unknown(self._knowing, self._lacks)
 
     def watched(self) -> dict[str, str]:
-        """Return the name of the query for the presence of each check variable: variable → query name.
+        """Return the query that finds the frames of each variable's entities: variable → query name.
 
         Later reads include this query.
         """
@@ -466,7 +466,7 @@ class StoreCheck:
         return {node: one.name for node, one in found if isinstance(one, Proposition)}
 
     def violated(self, trace: TraceReader, present: Mapping[str, str]) -> bool:
-        """True if a range of frames, taken as a whole trace, violates the check.
+        """True if a range of frames violates the check, taken as a whole trace.
 
         Parameters
         ----------
@@ -488,7 +488,7 @@ class StoreCheck:
             self._people[trace.trace_id] = everybody
 
     def _unknown(self, catalog: Catalog, lacks: Mapping[int, str]) -> Iterator[Verdict]:
-        """Yield an unknown verdict for each trace in ``lacks``, with its reason."""
+        """Yield an unknown verdict, with its reason, for each trace that lacks data."""
         _, left = traces_of(self._whole, catalog)
         for facts in catalog.traces:
             chosen = catalog.only is None or facts.trace_id in catalog.only
@@ -498,7 +498,7 @@ class StoreCheck:
 
     @cached_property
     def _absences(self) -> dict[int, int]:
-        """Return the number of frames in which an entity of the check is absent: trace id → number."""
+        """Return the number of frames in which an entity of the check is absent: trace id → frame count."""
         frames = frame_times(self._file, None)["frame_id"]
         full = np.ones(len(frames), np.bool_)
         traces, owners = np.unique(trace_of(frames), return_inverse=True)
@@ -592,7 +592,7 @@ class StoreCheck:
         return any(len(trace.relations[name].frames) for name in doubts)
 
     def _reason(self, trace: TraceReader, levels: Sequence[Level], judged: Judged) -> str:
-        """Return the reason of an unknown verdict as text: the condition, its entities and its frame."""
+        """Return a text that explains an unknown verdict: the unknown condition, its entities and its frame."""
         rows = np.flatnonzero(judged.codes == UNKNOWN)
         if not len(rows):
             return "it is unknown whether a quantifier is about an entity"
@@ -609,7 +609,7 @@ class StoreCheck:
         return doubt_text(self._plan.doubts[name], who, f"{trace.name}#{trace.numbers[frame]}")
 
     def _decisive_doubt(self, trace: TraceReader, binding: Keys) -> tuple[str, int] | None:
-        """Return the unknown condition that decides the verdict for some entities, and its frame; or None."""
+        """Return the unknown condition that decides the verdict of some entities, and its frame; or None."""
         values = PlanValues(self._plan, trace, self._variables, binding)
         columns: dict[str, Floats] = {}
         for name in propositions(self._formula):
@@ -647,7 +647,7 @@ class StoreCheck:
         return Robustness(value, condition_text(self._plan, name), *when, nodes, called, upper)
 
     def _sides(self, quantity: Formula, trace: TraceReader, bindings: Keys) -> Iterator[Floats]:
-        """Yield the robustness margins (B,) of the check for each combination of entities.
+        """Yield arrays with the robustness margin of each combination of entities, (B,).
 
         Unknown values count against the check. If there may be some, further margins count them in its favour.
         """
@@ -668,7 +668,7 @@ class StoreCheck:
                 return
 
     def _least_margins(self, trace: TraceReader, bindings: Keys) -> Floats | None:
-        """Return the robustness margins (B,) from least values alone; ``None`` if they do not suffice."""
+        """Return each entity combination's robustness, if smallest values suffice to compute it; or None."""
         doubts = {doubt for _, doubt in self._plan.states.values() if doubt is not None}
         if not self._least or any(len(trace.relations[name].frames) for name in doubts):
             return None
@@ -686,7 +686,7 @@ class StoreCheck:
         return found
 
     def margins(self, trace: TraceReader) -> Floats:
-        """Return the robustness margins of the check on a trace. NaN means that only unknown numbers decide.
+        """Return the robustness margins of the check on a trace. NaN: only unknown numbers decide.
 
         For an ``ALWAYS`` check over all entities: shape (F,), the margin of each frame. Unknown entities and
         frames are ignored. For any other check: shape (1,), the margin of the whole trace.
@@ -726,7 +726,7 @@ class StoreCheck:
         return MarginTable(columns, trace.clock.times, trace.clock.tolerance)
 
     def _bounds(self, trace: TraceReader, bindings: Keys) -> tuple[Bools, Bools]:
-        """Return the lowest and highest possible verdict of each entity combination.
+        """Return the lowest and the highest possible verdict of each combination of entities.
 
         Unseen events in recording gaps may change the verdict.
         """
@@ -745,7 +745,7 @@ class StoreCheck:
     def _levels(
         self, trace: TraceReader, counted: str = FAVOURABLE, *, waiting: bool = False
     ) -> list[Level]:
-        """Return the combinations of entities at each quantifier of the check, outermost quantifier first.
+        """Return the combinations of entities for each quantifier of the check, outermost quantifier first.
 
         ``waiting`` adds entities that may appear later.
         """
@@ -799,7 +799,7 @@ class StoreCheck:
         return bindings[first], members.reshape(-1)
 
     def _evaluated(self, trace: TraceReader, bindings: Keys) -> tuple[Codes, list[_BindingVerdict]]:
-        """Return the verdict for each combination of entities, with violations of those that need them."""
+        """Return the verdict of each combination of entities, and the violations where they are needed."""
         values = PlanValues(self._plan, trace, self._variables, bindings)
         codes, told = self._in_evaluation(trace, values, len(bindings))
         doubts = [name for name in propositions(self._formula) if name[-1] in SIGNS]
@@ -899,7 +899,7 @@ class StoreCheck:
     def _joined(
         self, levels: Sequence[Level], told: list[_BindingVerdict], frames: int
     ) -> Statuses | None:
-        """Return the status of the check after each frame, combined from all combinations of entities."""
+        """Return the check's status after each frame, combined from the status of each entity combination."""
         if not self._want_status:
             return None
         rows = [status for _, status in told if status is not None]

@@ -1,4 +1,4 @@
-"""First frame after which the truth value of a formula cannot change, whatever frames follow."""
+"""First frame at which the truth value of a formula is final: no later frame can change it."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ Decided = tuple["Places", "Places"]
 def known(  # noqa: PLR0911 - a case each
     formula: Formula, table: PropositionTable, *, ended: int | None = None
 ) -> Decided:
-    """Return, for each frame, the frame at which a formula becomes certainly true, and certainly false.
+    """For each frame, return when the formula at this frame is decided as true, and when as false.
 
     F means never.
 
@@ -88,7 +88,7 @@ def known(  # noqa: PLR0911 - a case each
 
 
 def endless(formula: Formula) -> bool:
-    """True if a formula is an *until* without upper time bound, which stays open until the trace ends."""
+    """True if a formula is an *until* without upper time bound. It can stay open until the trace ends."""
     return isinstance(formula, Until) and formula.bound.high is None
 
 
@@ -109,7 +109,7 @@ def _known_until(formula: Until, table: PropositionTable, *, ended: int | None) 
 
 
 def _is_over(bound: Bound, table: PropositionTable, widened: int) -> Bools:
-    """Return a mask (F,) of the frames whose time bound lies completely within the trace."""
+    """Return a mask of the frames whose time bound is over, or unlimited, when the trace ends."""
     if bound.high is None:
         return np.ones(len(table.times), np.bool_)
     if bound.frames:
@@ -118,7 +118,7 @@ def _is_over(bound: Bound, table: PropositionTable, widened: int) -> Bools:
 
 
 def _known_since(formula: Since, table: PropositionTable, *, ended: int | None) -> Decided:
-    """Return, for each frame, the frames at which a temporal *since* becomes certainly true and false.
+    """For each frame, return when a *since* is decided as true, and when as false.
 
     The frames before the trace count as known.
     """
@@ -141,7 +141,7 @@ def _known_since(formula: Since, table: PropositionTable, *, ended: int | None) 
 
 
 def met(right: Places, left: Places | None, bound: Bound, table: PropositionTable) -> Places:
-    """Return, for each frame, the first frame in which a temporal *until* is certain to be true.
+    """For each frame, return the first frame at which an *until* is decided as true.
 
     Operands that become true must stay true.
 
@@ -160,7 +160,7 @@ def met(right: Places, left: Places | None, bound: Bound, table: PropositionTabl
 
 
 def _asked(bound: Bound, table: PropositionTable) -> tuple[Places, Places | None]:
-    """Return the range of frames in the time bound of an *until*, for each frame: first frame, and end.
+    """For each frame, return the start and the end of the time bound of an *until*, as frames.
 
     ``None`` means no upper bound.
     """
@@ -179,7 +179,7 @@ def _chained(
     *,
     least: bool,
 ) -> Places:
-    """Return the frame at which a temporal *until* is certain, computed from the frames of its operands.
+    """For each frame, return the frame at which an *until* is decided, from those of its operands.
 
     It uses minima and maxima of the numbers.
 
@@ -219,7 +219,7 @@ def _chained(
 
 
 def _most(values: Places, start: Places, end: Places | None) -> Places:
-    """Return the maximum of the values in the index range from ``start`` up to, but not including, ``end``.
+    """Return, for each index range, the maximum of the values from ``start`` up to just before ``end``.
 
     An empty range gives the smallest integer.
     """

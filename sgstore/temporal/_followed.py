@@ -1,4 +1,4 @@
-"""Recent graphs of an online run, with the truth of pattern parts and curves of attributes over time."""
+"""Recent graphs of an online run. They show when pattern parts were true, and the values of attributes."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ W = TypeVar("W", "FollowedMatch", "FollowedCurve")
 
 
 class NotKeptError(SgstoreError):
-    """Error for a query that needs data of a past frame which the monitor does not keep.
+    """Error: a query needs data of a past frame, and the monitor has not kept them.
 
     These data are the frame class and the lane roles.
     """
 
 
 class FollowedMatch:
-    """Truth of each part of a pattern in each recent frame, for the nodes of one match.
+    """Frames among the recent ones in which each part of a pattern is true, for the nodes of one match.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ class FollowedMatch:
                     spans.append((seq, seq))
 
     def lanes(self, trace: str, first: int) -> TruthLanes:
-        """Return the frames in which each part of the pattern is true, from frame ``first`` on.
+        """For each part of the pattern, return the frames from ``first`` on in which the part is true.
 
         The format is that of :meth:`sgstore.Store.parts`.
         """
@@ -111,7 +111,7 @@ class FollowedMatch:
 
 
 class FollowedCurve:
-    """Curve of an attribute of an entity, or of a number of two entities, over recent frames.
+    """Recent values of an entity's attribute, or of a number of two entities, as a curve over time.
 
     Parameters
     ----------
@@ -182,7 +182,7 @@ class RecentGraphs:
             one.look([view])
 
     def view(self, seq: int) -> FrameView:
-        """Return the scene graph of a recent frame by its number. An old frame raises an error.
+        """Return the scene graph of a recent frame. The number of a frame that was dropped raises an error.
 
         Raises
         ------
@@ -196,14 +196,14 @@ class RecentGraphs:
         raise StoreError(f"the graph of frame #{seq} is not kept; those from #{first} on are")
 
     def match(self, name: str, query: Query, nodes: Mapping[str, int]) -> FollowedMatch:
-        """Return the truth of each part of a pattern in recent frames, and update it in later frames.
+        """Return the recent frames in which each part of a pattern is true. Later frames update the result.
 
         Errors: see :class:`FollowedMatch`.
         """
         return self._follow((name, *sorted(nodes.items())), partial(FollowedMatch, query, nodes))
 
     def curve(self, attribute: str, node: int, other: int | None = None) -> FollowedCurve:
-        """Return the curve of a value in recent frames, and update it in later frames.
+        """Return the curve of a value in recent frames. Later frames update the result.
 
         Errors: see :class:`FollowedCurve`.
         """

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """Time or frame range of a temporal operator, such as [0 s, 2 s]. It is measured from the current frame.
+    """Time bound of a temporal operator, such as [0 s, 2 s] from the current frame on; or frame numbers.
 
     Attributes
     ----------
@@ -31,7 +31,7 @@ class Bound:
     frames: bool = False
 
     def widened(self, by: int) -> Bound:
-        """Return the time range, extended by a tolerance (ns) at both ends. Frame ranges do not change."""
+        """Return the time bound, extended at both ends by a tolerance (ns). Bounds in frames stay unchanged."""
         if self.frames or not by:
             return self
         return Bound(max(self.low - by, 0), None if self.high is None else self.high + by)
@@ -129,27 +129,27 @@ TRUE: Final = TruthConstant(value=True)
 
 
 def eventually(operand: Formula, bound: Bound = WHOLE) -> Formula:
-    """Return the temporal formula: the operand is true at this frame or a later one."""
+    """Return the formula *eventually*: the operand is true at this frame or a later one."""
     return Until(TRUE, operand, bound)
 
 
 def always(operand: Formula, bound: Bound = WHOLE) -> Formula:
-    """Return the temporal formula: the operand is true at this frame and all later ones."""
+    """Return the formula *always*: the operand is true at this frame and all later ones."""
     return Not(eventually(Not(operand), bound))
 
 
 def once(operand: Formula, bound: Bound = WHOLE) -> Formula:
-    """Return the temporal formula: the operand is true at this frame or an earlier one."""
+    """Return the formula *once*: the operand is true at this frame or an earlier one."""
     return Since(TRUE, operand, bound)
 
 
 def historically(operand: Formula, bound: Bound = WHOLE) -> Formula:
-    """Return the temporal formula: the operand is true at this frame and all earlier ones."""
+    """Return the formula *historically*: the operand is true at this frame and all earlier ones."""
     return Not(once(Not(operand), bound))
 
 
 def release(left: Formula, right: Formula, bound: Bound = WHOLE) -> Formula:
-    """Return the formula "``right`` stays true until ``left`` is true, or for ever" (*release*).
+    """Return the formula *release*: ``right`` is true up to and including the first frame of ``left``.
 
     ``right`` is still true in the frame of ``left``.
     """
@@ -171,7 +171,7 @@ def propositions(formula: Formula) -> frozenset[str]:
 
 
 def walk(formula: Formula) -> Iterator[Formula]:
-    """Yield a temporal formula and all its subformulas, subformulas first. Equal ones may repeat."""
+    """Yield a temporal formula and all its subformulas, smallest first. Equal ones may repeat."""
     for operand in operands_of(formula):
         yield from walk(operand)
     yield formula

@@ -1,4 +1,4 @@
-"""Join of the bindings of several steps of a sequence, on the variables that they share."""
+"""Join of sequence steps: node combinations that match all steps and agree on shared variables."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ROWS: Final = 2_000_000
 
 @dataclass(frozen=True, slots=True)
 class JoinedBindings:
-    """Combinations of nodes that match several sequence steps, with their rows in the table of each step.
+    """Node combinations that match several sequence steps, and the index of each in the steps' tables.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class JoinedBindings:
     places: Ints
 
     def parts(self, relations: Sequence[TimedRelation]) -> Iterator[JoinedBindings]:
-        """Split the node combinations into groups with a limited number of frame rows."""
+        """Split the node combinations into groups with a limited number of rows (one per matching frame)."""
         if not len(self.bindings):
             return
         rows = np.zeros(len(self.bindings), np.int64)
@@ -72,7 +72,7 @@ def joined(
 
 
 def written(key: str) -> str:
-    """Return the name in the query for a node key. A repeated variable has one key per repetition."""
+    """Return the name of a node as the query writes it, from its internal key such as ``v~2``."""
     return key.partition("~")[0]
 
 
@@ -100,7 +100,7 @@ def _with(
 
 
 def _pairs(left: Keys, right: Keys) -> tuple[Ints, Ints]:
-    """Return the index pairs of equal rows in two tables, ordered by the first table."""
+    """Return all pairs of equal rows of two tables as two arrays of indices, ordered by the first table."""
     if not len(left) or not len(right):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     codes = codes_of(np.concatenate((left, right)))

@@ -25,7 +25,7 @@ SELECT frame_id >> 24 AS trace_id, max(speed) AS speed FROM known_state GROUP BY
 
 @dataclass(frozen=True, slots=True)
 class ShortRange:
-    """Reasons why the stored range of a trace is too short to decide a check as true, or as false.
+    """Two reasons: why the stored range of a trace is too short for the verdict true, and for false.
 
     An empty text means that it can.
 
@@ -38,19 +38,19 @@ class ShortRange:
     false: str = ""
 
     def of(self, *, holds: bool) -> str:
-        """Return the reason why the range of a trace does not allow a true (or false) verdict.
+        """Return the reason why the range of the trace is too short for the given verdict.
 
         An empty text means that it does.
         """
         return self.true if holds else self.false
 
     def or_else(self, other: ShortRange) -> ShortRange:
-        """Return these reasons, with each missing reason taken from ``other``."""
+        """Return a copy of the two reasons, with each empty one replaced by that of ``other``."""
         return ShortRange(self.true or other.true, self.false or other.false)
 
 
 def short_ranges(file: StoreFile, catalog: Catalog, check: BoundCheck) -> Mapping[int, ShortRange]:
-    """Return the traces whose stored range around the ego is too short for a check: trace id → reasons.
+    """Return the reasons why the range stored around the ego is too short for a check: trace id → reasons.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def _any_short(needed: Horizon, known: list[float]) -> bool:
 
 
 def short_range(needed: Horizon, known: float) -> ShortRange:
-    """Return the reasons why a stored range around the ego (m) is too short for a check.
+    """Return the reasons why the range stored around the ego, in m, is too short for a check.
 
     They are empty if it is long enough.
 
@@ -102,7 +102,7 @@ def short_range(needed: Horizon, known: float) -> ShortRange:
 
 
 def without_kinds(check: BoundCheck, excluded: frozenset[str]) -> ShortRange:
-    """Return the reasons why a trace cannot prove a check, because its settings exclude node kinds.
+    """Return the reasons why a trace cannot decide a check: its settings exclude kinds of node.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ class SeenRange:
         self.fastest = max(self.fastest, *speeds, 0.0)
 
     def short(self, check: BoundCheck) -> ShortRange:
-        """Return the reasons why the frames of the monitor cannot prove a check true, or false."""
+        """Return the reasons why the frames seen so far cannot prove the check true, and false."""
         if not check.world or check.unknown_is_false:
             return ShortRange()
         found = ShortRange()

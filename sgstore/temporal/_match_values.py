@@ -70,7 +70,7 @@ class ReturnedValues:
         part: Callable[[b.OverMatch], Any],
         seconds: Callable[[int], float | None] | None = None,
     ) -> dict[str, Any] | None:
-        """Return the ``RETURN`` values of one match: column → value. ``None`` if ``HAVING`` rejects the match.
+        """Return the ``RETURN`` values of one match, column → value; None if its ``HAVING`` is false.
 
         Parameters
         ----------
@@ -104,7 +104,7 @@ AT_FRAME: Final = -1
 
 @dataclass(frozen=True, slots=True)
 class Stretches:
-    """First and last frame of each match, with the row of its nodes in the array of values.
+    """First and last frame of each match, and the row of its nodes in the arrays of values.
 
     Attributes
     ----------
@@ -119,7 +119,7 @@ class Stretches:
     last: Ints
 
     def told(self, word: str, column: Column, at: Column | None = None) -> Objects:
-        """Return the aggregate of a value over the frames of each match, (M,). ``None`` means unknown.
+        """For each match, return an aggregate of the values in its frames, or None if unknown.
 
         Parameters
         ----------
@@ -144,7 +144,7 @@ class Stretches:
 
 
 def over_rows(word: str, column: Column, starts: Ints, at: Column | None = None) -> Objects:
-    """Return an aggregate, such as the minimum, over each group of array rows. ``None`` means unknown.
+    """For each group of rows, return an aggregate such as the minimum, or None if unknown.
 
     Parameters
     ----------
@@ -188,7 +188,7 @@ def over_rows(word: str, column: Column, starts: Ints, at: Column | None = None)
 
 
 def picked(column: Column, rows: Ints, frames: Ints) -> Objects:
-    """Return the values of a column at some rows and frames as Python objects. ``None`` means unknown.
+    """Return the values at some rows and frames as Python objects, with None for unknown ones.
 
     Parameters
     ----------
@@ -207,7 +207,7 @@ def _told(values: Any, known: Any, places: Any) -> Objects:
 
 
 def _at(column: Column, rows: Ints, frames: Ints) -> tuple[Any, Bools]:
-    """Return the values of a column at some rows and frames, and a mask of the known ones.
+    """Return the values at some rows and frames, and a mask of the known ones.
 
     Axes of length 1 are broadcast.
     """

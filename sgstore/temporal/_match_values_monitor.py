@@ -37,7 +37,7 @@ Span = tuple[int, int]
 
 
 class _Course:
-    """History of one value for all matched nodes. It is stored as long as a match may need it."""
+    """Recent values of one expression for all matched nodes. A value stays as long as a match may need it."""
 
     def __init__(
         self,
@@ -76,14 +76,14 @@ class _Course:
         return [value if there else None for value, there in zip(values, known, strict=True)]
 
     def value(self, binding: Mapping[str, int | None], span: Span) -> Any:
-        """Return the aggregate of the value for given nodes over a range of frames."""
+        """Return an aggregate of the values of some nodes in a range of frames."""
         start, end = span
         _, folds = self._known.of(tuple(binding.get(name) for name in self._variables))
         inside = [fold for fold in folds if start <= fold.start and fold.end <= end]
         return reduce(Fold.joined, inside).told(self._word, start, end) if inside else None
 
     def forget(self, kept: Sequence[int]) -> None:
-        """Merge the values of frames at which no later match begins or ends, to save memory.
+        """Merge stored values to save memory. Only frames where a later match may begin or end stay separate.
 
         ``kept`` lists the frames at which a later range may begin or end.
         """
@@ -148,7 +148,7 @@ class MatchValues:
             course.step()
 
     def forget(self, kept: Iterable[int]) -> None:
-        """Merge the values of old frames. ``kept`` lists the frames at which a later match may begin or end.
+        """Merge the values of old frames. ``kept``: frames at which a later match may begin or end.
 
         Parameters
         ----------
@@ -160,7 +160,7 @@ class MatchValues:
             course.forget(ordered)
 
     def value(self, part: b.OverMatch, binding: Mapping[str, int | None], span: Span) -> Any:
-        """Return an aggregate over a range of frames of a match, for its nodes. ``None`` means unknown.
+        """Return an aggregate of a match's values in a range of frames, or None if unknown.
 
         Parameters
         ----------
@@ -208,7 +208,7 @@ class Fold:
 
     @classmethod
     def of(cls, word: str, frame: int, value: Any, at: Any) -> Fold | None:
-        """Return the aggregates of a single frame. ``None`` if its value is unknown or not wanted."""
+        """Return the aggregates of a single frame; None if its value is unknown or not needed."""
         if value is None:
             return None
         if word in {"first", "last"}:
@@ -223,7 +223,7 @@ class Fold:
         return cls(frame, frame, value, value, best, at)
 
     def joined(self, later: Fold) -> Fold:
-        """Return the aggregates of this range of frames and the following range together.
+        """Return the aggregates of this range of frames combined with those of the range after it.
 
         For equal extremes, the earlier frame counts.
         """

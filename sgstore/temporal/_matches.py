@@ -62,7 +62,7 @@ def lacking(file: StoreFile, catalog: Catalog, needs: Iterable[Need]) -> dict[in
 def _knowing(
     file: StoreFile, catalog: Catalog, every: frozenset[int], need: Need
 ) -> frozenset[int]:
-    """Return the ids of the traces that have the required data, or do not need it."""
+    """Return the ids of the traces that have all data that the query requires."""
     if need.event:
         return frozenset(trace for (trace,) in file.rows(told_events(need.event)).values)
     if need.lanes:
@@ -88,7 +88,7 @@ def _knowing(
 
 
 def _about_trace(query: Query) -> list[Bound]:
-    """Return the conditions on the trace (not on its frames) that every match of a query meets."""
+    """Return the conditions on attributes of the trace that a query requires in every match."""
     certain = [query.steps[number].scope for number in sorted(query.certain)]
     each = (c for scope in certain or query.required for w in scope.where for c in conjuncts(w))
     plain = (Operation, Value, Choices, TraceAttribute)
@@ -114,7 +114,7 @@ class TemporalMatches(Matches):
 
     @property
     def of_match(self) -> bool:  # type: ignore[override]
-        """True if the query returns a single value that describes a whole match."""
+        """True if a value to return describes a whole match and not one frame."""
         values = self._ready.query.result.columns if len(self.columns) == 1 else ()
         return any(isinstance(part, OverMatch) for one in values for part in walk(one.value))
 
@@ -132,7 +132,7 @@ class TemporalMatches(Matches):
 
     @contextmanager
     def asked(self) -> Generator[Compiled]:
-        """Context manager with the query compiled for the store. The store cannot change inside the block."""
+        """Context manager that returns the compiled query. Inside it, the store cannot change."""
         with self._compiled() as compiled:
             yield compiled
 

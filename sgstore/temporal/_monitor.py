@@ -320,7 +320,7 @@ class Monitor:
         return f"<Monitor of {', '.join(self.names)} after {seen} frames>"
 
     def _of_scope(self, ego: str | None, *, world: bool) -> tuple[int, QueryCache]:
-        """Return the index and the query cache for an ego and a scope (scene graph only, or whole world)."""
+        """Return the query cache for an ego, and its index. ``world``: also entities outside the graphs."""
         if (ego or "") not in self._egos:
             self._egos.append(ego or "")
         scope = self._egos.index(ego or ""), world
@@ -383,7 +383,7 @@ class Monitor:
     def _ask(
         self, graphs: Sequence[SceneGraph], *, classed: bool = False
     ) -> tuple[FrameTime, list[NodeNames]]:
-        """Run all single-frame queries on the graphs of a frame. Return its time, and the nodes of each ego."""
+        """Run all single-frame queries on the graphs of a frame. Return its time, and each ego's nodes."""
         self._pulse.step(graphs[0].time_ns)
         tick, time = self._pulse.tick, self._pulse.told(self._pulse.tick.time)
         here = FrameTime(tick.number, time, seconds_of(time - self._pulse.start))
@@ -399,7 +399,7 @@ class Monitor:
         return here, people
 
     def _tell(self, here: FrameTime, people: list[NodeNames]) -> tuple[MonitorEvent, ...]:
-        """Update the checks and patterns with the results of a frame, and return the new events."""
+        """Update the checks and patterns with the query results of a frame, and return the new events."""
         self._last = here
         found: list[MonitorEvent] = []
         for ego, watch, waiting in self._watches:
@@ -485,7 +485,7 @@ class Monitor:
 
     @property
     def robustness(self) -> dict[str, Robustness]:
-        """Return the robustness of each check with ``ROBUSTNESS`` if the trace ends now: name → robustness.
+        """Return the robustness of each check with ``ROBUSTNESS`` if the trace ended now: name → value.
 
         Examples
         --------
@@ -563,7 +563,7 @@ class Monitor:
 
 
 class _PendingEvents:
-    """Monitor events that wait until the trace has all data that they need.
+    """Monitor events that are held back until the trace has had all data that the query requires.
 
     Parameters
     ----------
@@ -586,7 +586,7 @@ class _PendingEvents:
     def passed(
         self, found: list[MonitorEvent], here: FrameTime, people: NodeNames
     ) -> list[MonitorEvent]:
-        """Return the monitor events to report at this frame, including earlier events that had to wait."""
+        """Return the events to report at this frame. They include events that were held back until now."""
         if not self._open:
             return found
         self._open = [need for need in self._open if not self._told(need, people)]

@@ -137,7 +137,7 @@ class PlanValues(SignalValues):
         self._tests: dict[str, Column] = {}
 
     def evaluation(self, counted: str) -> PlanValues:
-        """Return a copy in which unknown conditions count for, or against, the check, as ``counted`` states.
+        """Return a copy that counts unknown conditions as given: for the check, or against it.
 
         Other values are shared.
         """
@@ -152,20 +152,20 @@ class PlanValues(SignalValues):
         return self._tests[test.name]
 
     def formula(self, formula: Formula) -> Bools:
-        """Return a mask (B, F) of the node combinations and frames for which a temporal formula is true."""
+        """Return a mask (B, F): for each node combination and frame, true if a temporal formula is true."""
         lenient = tolerant(formula, self.clock.tolerance)
         times, rows = self.clock.times, len(self._bindings)
         return evaluate_rows(lenient, self.columns(formula), times, rows)
 
     def columns(self, formula: Formula) -> dict[str, Bools]:
-        """Return the propositions (single-frame conditions) of a formula as masks: name → (B, F) or (1, F).
+        """Return the truth of each single-frame condition of a formula as a mask: name → (B, F) or (1, F).
 
         (1, F) is equal for all node combinations.
         """
         return {name: self.proposition(name) for name in propositions(formula)}
 
     def proposition(self, name: str) -> Bools:
-        """Return a mask (B, F) or (1, F) of the frames in which a proposition of a formula is true."""
+        """Return a mask of the frames in which a single-frame condition of a formula is true."""
         if name[-1] in SIGNS:
             if name[-1] != self._counted:
                 return np.zeros((1, len(self._trace)), np.bool_)
@@ -180,11 +180,11 @@ class PlanValues(SignalValues):
         return self._atoms[name]
 
     def condition(self, expression: Bound, test: Test) -> Bools:
-        """Return a mask (B, F) of the frames in which the condition inside ``run_length(…)`` etc. is true."""
+        """Return a mask of the frames in which the condition inside ``run_length(…)`` or similar is true."""
         return self.formula(test.formulas[expression])
 
     def margins(self, course: SignalCall, test: Test) -> Floats:
-        """Return the robustness margins (B, F) of the condition inside ``robustness(…)``."""
+        """Return the margin of the condition in ``robustness(…)``, for each combination and frame, (B, F)."""
         rows, size = len(self._bindings), max(self._trace.together // MARGIN_CELLS, 1)
         if rows > size:
             parts = (self._bindings[low : low + size] for low in range(0, rows, size))
@@ -197,7 +197,7 @@ class PlanValues(SignalValues):
         return np.broadcast_to(value, (rows, len(self._trace)))
 
     def signal(self, signal: Ask) -> Column:
-        """Return the values (B, F) of a single-frame query with a value, such as a speed."""
+        """Return a number such as a speed for each node combination and frame, (B, F)."""
         if isinstance(self._plan, CheckPlan) and signal.name in self._plan.states:
             return self._state(*self._plan.states[signal.name])
         found = self._trace.relations[signal.name]
@@ -205,7 +205,7 @@ class PlanValues(SignalValues):
         return found.column(places, len(self._trace))
 
     def _state(self, of: Ask | None, doubt: str | None) -> Column:
-        """Return a column (B, F) with the state of a value: 0 known, 1 unknown.
+        """Return 0 for each node combination and frame in which a value is known, otherwise 1, (B, F).
 
         Frames without the entity are masked.
         """
@@ -228,7 +228,7 @@ Alternatives = frozenset[frozenset[str]]
 
 @dataclass(frozen=True, slots=True)
 class Premises:
-    """Sets of queries: a check can be false in a trace only if all queries of one set have matches there.
+    """Sets of queries. A trace that violates a check has matches of all queries of at least one set.
 
     Attributes
     ----------
@@ -242,7 +242,7 @@ class Premises:
 
     @property
     def order(self) -> list[str]:
-        """Names of the queries in reading order: queries with few matches and low cost come first."""
+        """Names of the queries in the order in which to run them: few matches and low cost first."""
         named = {name for one in self.alternatives for name in one}
 
         def rank(name: str) -> tuple[bool, bool, int]:
@@ -252,12 +252,12 @@ class Premises:
         return sorted(self.asks, key=rank)
 
     def left(self, relations: Mapping[str, TimedRelation]) -> list[frozenset[str]]:
-        """Return the sets whose queries all have matches in a trace, as far as they were read."""
+        """Return the sets that remain possible: none of their queries was run without a match."""
         empty = {name for name, one in relations.items() if not len(one.keys)}
         return [one for one in self.alternatives if not one & empty]
 
     def nodes(self, ask: Ask, traces: Iterable[TraceReader]) -> dict[str, Ints]:
-        """Return the nodes to which a query can be limited in some traces: variable → node ids."""
+        """Return the only nodes of some traces that a query has to search: variable → node ids."""
         found: dict[str, list[Ints] | None] = {name: [] for name in ask.variables}
         for trace in traces:
             for one in self.left(trace.relations):
@@ -296,7 +296,7 @@ def traces(
     within: Window | None = None,
     premises: Premises | None = None,
 ) -> Iterator[TraceReader]:
-    """Yield the traces that have the data of a query, loaded into memory, in catalog order.
+    """Yield the traces that have the data of a query, loaded into memory, in the order of the catalog.
 
     Traces are read in small groups, so memory does not grow with the store. If a group has too many rows, its
     halves are read again.
@@ -340,7 +340,7 @@ def groups(
     gaps: str = "break",
     within: Window | None = None,
 ) -> Iterator[TraceGroup]:
-    """Yield the traces of :func:`traces` in groups, in the order of their ids, which is fastest."""
+    """Yield the same traces as :func:`traces`, loaded into memory in groups, by trace id. It is faster."""
     every = sorted(extents(catalog))
 
     def ask(window: Window | None) -> tuple[TraceGroup, int]:
@@ -373,7 +373,7 @@ def read(
     gaps: str,
     premises: Premises | None = None,
 ) -> tuple[TraceGroup, int]:
-    """Return the traces of a window, loaded into memory, and the number of rows read. :func:`traces` calls it.
+    """Return the traces of a window of frames, loaded into memory, and the number of rows read.
 
     Raises
     ------
@@ -399,7 +399,7 @@ def read(
 
 
 def _together(asks: Mapping[str, Ask], premises: Premises | None) -> dict[str, list[str]]:
-    """Return groups of names of queries that are read together: name of the first query → all names.
+    """Group the queries that are read together: name of the first query → names of its group.
 
     The other queries of a group return values of the same matches, or are conditions on them.
     """
@@ -413,7 +413,7 @@ def _together(asks: Mapping[str, Ask], premises: Premises | None) -> dict[str, l
 
 
 def _is_among(ask: Ask, leader: Ask, premises: Premises | None) -> bool:
-    """True if the matches of a query are those of a leader with a value, or those that meet a condition.
+    """True if the matches of a query can be read together with those of another query.
 
     The conditions are such that the matches of the leader are not slower to find: numbers of two entities.
     Premises limit the matches of conditions, so their queries come first.
@@ -443,7 +443,7 @@ def _conditions_among(ask: Ask, leader: Ask) -> list[Bound]:
 
 
 def _narrowed(ask: Ask, group: TraceGroup, left: Bools, premises: Premises | None) -> Ask | None:
-    """Return a single-frame query limited to the nodes that earlier queries matched.
+    """Return a single-frame query that searches only the nodes that earlier queries matched.
 
     ``None`` means that they matched no nodes.
     """
@@ -462,7 +462,7 @@ def _narrowed(ask: Ask, group: TraceGroup, left: Bools, premises: Premises | Non
 
 
 def _left(ask: Ask, group: TraceGroup, premises: Premises | None) -> Bools:
-    """Return a mask of the traces in which all earlier queries that this query needs have matches."""
+    """Return a mask of the traces that a query must still search: earlier queries have matches there."""
     found = np.ones(len(group.ids), np.bool_)
     for before in ask.after:
         found &= np.bincount(group.relations[before.name].keys[:, 0], minlength=len(found)) > 0
@@ -498,7 +498,7 @@ def chosen_traces(file: StoreFile, query: Query, catalog: Catalog) -> dict[int, 
 
 
 def frame_times(file: StoreFile, window: Window | None) -> dict[str, Ints]:
-    """Return ids, numbers, times and log times of the frames of a window, ordered by id."""
+    """Return ids, numbers, times and log times of all frames in a window, ordered by id."""
     low, high = (window.low << FRAME_BITS, window.high << FRAME_BITS) if window else (0, _LAST)
     sql, values = CLOCK, (low, high)
     if window and window.traces is not None:
@@ -508,7 +508,7 @@ def frame_times(file: StoreFile, window: Window | None) -> dict[str, Ints]:
 
 
 def buckets_of(file: StoreFile, window: Window | None) -> dict[str, Ints]:
-    """Return the buckets (64 frames each) of a window, with bit masks of their frames.
+    """Return the buckets (64 frames each) of a window. A bit mask marks the existing frames of each.
 
     One mask has all frames, one has the frames without a gap before them.
     """
@@ -542,7 +542,7 @@ def arrays_of(
     values: Sequence[Bound],
     most: int,
 ) -> tuple[Ints, Keys, list[Any]]:
-    """Return the matches of a single-frame query as arrays, unsorted: frame ids, node ids, and values.
+    """Return all matches of a single-frame query as arrays: frame ids, node ids and values; not sorted.
 
     For a signal, the relations of its edges follow the nodes.
 
@@ -564,7 +564,7 @@ def arrays_of(
 def masks_of(
     file: StoreFile, catalog: Catalog, ask: Ask, window: Window | None, most: int
 ) -> tuple[Ints, Keys, Ints]:
-    """Return the matches of a single-frame query without a value, unsorted: buckets, node ids, masks of frames.
+    """Return all matches of a single-frame query as unsorted arrays: buckets, node ids, frame masks.
 
     Raises
     ------
@@ -593,7 +593,7 @@ def _too_many(catalog: Catalog, ask: Ask, window: Window | None, most: int) -> T
 
 
 def _keys(ask: Ask, arrays: Mapping[str, Any], rows: int) -> Keys:
-    """Return the columns of nodes and edges of a result. Relations become their index in :func:`words`."""
+    """Return the columns of nodes and edges of a result. Each relation is an index in :func:`words`."""
     columns = [np.ma.getdata(arrays[key]).astype(np.int64, copy=False) for key in ask.variables]
     columns += [np.searchsorted(words(), np.ma.getdata(arrays[k]).astype(str)) for k in ask.edges]
     return np.stack(columns, axis=1) if columns else np.zeros((rows, 0), np.int64)
@@ -608,7 +608,7 @@ def _relate(
     group: TraceGroup,
     most: int,
 ) -> int:
-    """Run the query of a leader, add its matches to a group of traces, and return their number.
+    """Run the first query of a group, store the matches of the group in traces, and return their number.
 
     ``asks`` are the queries that are read with it, ``most`` is the largest number allowed.
     """
@@ -648,7 +648,7 @@ def _relate(
 
 
 def _deciding(asks: Mapping[str, Ask], keys: Keys, values: Sequence[Any]) -> Bools:
-    """Return a mask of the rows that can decide a result, if only the least value for the same nodes counts.
+    """Return a mask of the rows to keep if only the smallest value of the same nodes counts.
 
     Rows that meet a condition, and those with an unknown value, are always needed.
     """

@@ -1,4 +1,4 @@
-"""Evaluation plans: temporal formulas whose conditions are single-frame queries.
+"""Evaluation plans: temporal formulas, and single-frame queries for the conditions in them.
 
 A :class:`Plan` contains all single-frame data that the expressions of a statement need, without duplicates:
 
@@ -53,7 +53,7 @@ TRUE: Final = b.Value(value=True, type=Type.boolean)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ask:
-    """Query on single frames, whose results a temporal formula or a sequence needs.
+    """Query on single frames, as a part of the evaluation of a temporal formula or a sequence.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class Ask:
 
     @property
     def loose(self) -> bool:
-        """True if edges do not connect all nodes of the query. Such a query can have very many matches."""
+        """True if edges do not connect all nodes of the query. Such a query can have many matches."""
         scope = self.query.scope
         groups = [{node} for node in scope.nodes]
         for edge in scope.edges:
@@ -105,7 +105,7 @@ class Ask:
         return len(groups) > 1
 
     def among(self, nodes: Mapping[str, Iterable[int]]) -> Ask:
-        """Return the query limited to some ids for some of its nodes."""
+        """Return a copy of the query in which some nodes must have one of the given ids."""
         scope = self.query.scope
         where = (b.node_among(node, ids) for node, ids in nodes.items())
         narrower = replace(scope, where=(*scope.where, *where))
@@ -114,7 +114,7 @@ class Ask:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Test:
-    """Expression on values of several frames, evaluated as a column over the frames.
+    """Expression whose value depends on several frames, evaluated for all frames of a trace.
 
     Attributes
     ----------
@@ -217,7 +217,7 @@ class Plan:
         return frozenset(edge.key for edge in edges if len(edge.relations) > 1)
 
     def _things(self, expression: b.Bound) -> frozenset[str]:
-        """Return the keys of the nodes and edges in an expression, with the end nodes of the edges."""
+        """Return the keys of the nodes and edges in an expression, and of the end nodes of these edges."""
         edges = b.edges_of(expression)
         ends = (
             e for edge in self.whole.scope.edges if edge.key in edges for e in (edge.src, edge.dst)
@@ -225,7 +225,7 @@ class Plan:
         return b.nodes_of(expression) | edges | frozenset(ends)
 
     def _guarded(self, expression: b.Bound) -> frozenset[str]:
-        """Return the nodes and edges without which a single-frame condition is false."""
+        """Return the nodes and edges that must exist for a single-frame condition to be true."""
         match expression:
             case b.Operation("AND", operands):
                 return frozenset().union(*map(self._guarded, operands))
@@ -260,7 +260,7 @@ class Plan:
                 return self._atom(expression, self._things(expression))
 
     def _merged(self, operands: tuple[b.Bound, ...]) -> list[b.Bound]:
-        """Group the operands of an ``AND`` by their nodes, so that one query evaluates each group.
+        """Group the conditions that ``AND`` joins, so that one query evaluates each group.
 
         A condition joins a group if the group already uses all its nodes, and is false when one of them is
         absent. One combined query has fewer matches than separate queries.
@@ -289,7 +289,7 @@ class Plan:
         return [_all(parts) for _, parts in groups] + alone
 
     def present(self, node: str) -> f.Formula:
-        """Return the formula that is true in the frames in which a node is present."""
+        """Return a formula that is true in the frames in which a node is present."""
         return self._atom(TRUE, frozenset({node}))
 
     def _atom(self, expression: b.Bound, things: frozenset[str]) -> f.Formula:
@@ -304,7 +304,7 @@ class Plan:
         return f.Proposition(name)
 
     def test(self, expression: b.Bound) -> Test:
-        """Return the plan entry for an expression on values of several frames. Add it if it is new."""
+        """Return the plan entry of an expression over several frames. A new entry is added to the plan."""
         key = "=" + unnumbered_text(expression)
         name = self._names.get(key)
         if name is None:
@@ -381,7 +381,7 @@ def plan_of_steps(query: b.Query, steps: Sequence[BoundStep]) -> Plan:
 
 
 def kept_throughout(check: b.BoundCheck) -> b.Bound | None:
-    """Return the condition that a check requires in every frame for all entities. ``None`` for other checks."""
+    """Return the condition that a check requires in every frame; None if it is not such a check."""
 
     def lasting(formula: b.Bound) -> b.Bound | None:
         match formula:
@@ -414,7 +414,7 @@ def variables_of(check: BoundCheck) -> tuple[str, ...]:
 
 
 def asks_of_steps(query: b.Query, steps: Sequence[BoundStep], kept: Iterable[str]) -> list[Ask]:
-    """Return the single-frame query of each sequence step, named ``step 1``, ``step 2`` and so on.
+    """Return a query for each sequence step. The names are ``step 1``, ``step 2`` and so on.
 
     A query binds all nodes of a step if its conditions need them, else only the kept nodes.
     """
@@ -431,7 +431,7 @@ def asks_of_steps(query: b.Query, steps: Sequence[BoundStep], kept: Iterable[str
 
 
 def tied_in_steps(query: b.Query) -> tuple[frozenset[str], frozenset[str]]:
-    """Return the named nodes and edges that several steps share, and those shared within one repetition."""
+    """Return the keys of the named nodes, and of the named edges, in the steps of a sequence."""
     happen = [step for step in query.steps if query.spans and not step.absent]
     nodes = (node for step in happen for node in step.scope.nodes.values())
     edges = (edge.key for step in happen for edge in step.scope.edges if edge.named)
@@ -440,7 +440,7 @@ def tied_in_steps(query: b.Query) -> tuple[frozenset[str], frozenset[str]]:
 
 
 def _together(query: b.Query, size: int) -> list[frozenset[int]]:
-    """Return, for each step, the steps that every match with this step contains, including itself."""
+    """For each step of a sequence, return the steps that occur in each match that contains this step."""
     if not query.alternatives:
         return [frozenset(range(size))] * size
     ways = [frozenset(way.steps) for way in query.alternatives]
@@ -489,7 +489,7 @@ MARGINS: Final[Mapping[str, Callable[[b.Bound, b.Bound], b.Bound]]] = {
 
 
 def has_margin(comparison: b.Operation) -> bool:
-    """True if a condition compares numbers that are not all constant, so that it has a margin."""
+    """True if a condition compares numbers that can change. Such a condition has a margin."""
     constants = b.Value | b.Operation
     return (
         comparison.word in MARGINS
@@ -503,7 +503,7 @@ def _all(parts: list[b.Bound]) -> b.Bound:
 
 
 def _two_valued(expression: b.Bound, *, outermost: bool = True) -> b.Bound:  # noqa: PLR0911 - a case each
-    """Return a single-frame condition in which a comparison with an unknown value counts as false.
+    """Return a single-frame condition in which comparisons with an unknown value count as false.
 
     A plain conjunction does not change: unknown is not true.
     """
@@ -543,7 +543,7 @@ def _never_unknown(expression: b.Bound) -> bool:
 def plan_text(
     plan: Plan, formula: f.Formula, reset: f.Formula | None, catalog: Catalog | None = None
 ) -> str:
-    """Return an evaluation plan as text: the temporal formula and its queries. With a catalog, SQL is added."""
+    """Return an evaluation plan as text: temporal formula and queries. ``catalog`` adds the SQL."""
     lines = [f"formula {formula_text(formula)}"]
     lines += [f"reset {formula_text(reset)}"] if reset is not None else []
     lines += needs_text(plan, catalog)
@@ -551,7 +551,7 @@ def plan_text(
 
 
 def needs_text(plan: Plan, catalog: Catalog | None = None) -> list[str]:
-    """Return the queries and expressions of an evaluation plan as text lines. With a catalog, SQL is added."""
+    """Return the queries and expressions of an evaluation plan as lines of text. ``catalog`` adds the SQL."""
     lines: list[str] = []
     for ask in plan.asks.values():
         where = " AND ".join(value_text(part) for part in ask.query.scope.where) or "TRUE"
@@ -567,7 +567,7 @@ def needs_text(plan: Plan, catalog: Catalog | None = None) -> list[str]:
 
 
 def ask_text(ask: Ask) -> str:
-    """Return a short text for a single-frame query in error messages: step number, value or condition."""
+    """Return a short text that describes a single-frame query in error messages."""
     if ask.value is not None:
         return value_text(ask.value)
     conditions = " AND ".join(value_text(part) for part in ask.query.scope.where)
@@ -606,7 +606,7 @@ def length_text(length: Length) -> str:
 
 
 def _refuse_large(value: b.Bound) -> None:
-    """Raise an error if an expression over frames uses integers that float64 cannot represent exactly.
+    """Raise an error if an expression has integers too large for float64, which stores them inexactly.
 
     Single-frame conditions are exact.
 

@@ -1,4 +1,4 @@
-"""Queries that must have matches for a check to be false, so that other traces need no evaluation.
+"""Queries that must have matches if a check is false. Traces without these matches need no evaluation.
 
 An *alternative* is a set of queries. If no alternative has matches for all its queries, the formula is true. So
 only nodes in the matches of an alternative need evaluation, and only their data is read.
@@ -66,7 +66,7 @@ def bindings_of(
     *,
     injective: bool,
 ) -> Keys:
-    """Return the combinations of entities (B, n) of a trace that need evaluation, in ascending order."""
+    """Return the combinations of entities of a trace that need evaluation, sorted, one per row."""
     parts = [np.zeros((0, len(variables)), np.int64)]
     for one in premises.left(trace.relations):
         names = sorted(one, key=lambda name: len(trace.relations[name].keys))
@@ -96,7 +96,7 @@ def bindings_of(
 def premises_of(
     check: BoundCheck, plan: CheckPlan, formula: Formula, asks: Mapping[str, Ask]
 ) -> Premises | None:
-    """Return the query sets without whose matches a check is true. ``None`` if every trace needs evaluation."""
+    """Return the sets of queries that a false check needs; None if every trace needs evaluation."""
     for_all = all(quantifier.word == "FORALL" for quantifier in check.quantifiers)
     if not for_all or check.gaps == "unknown":
         return None
@@ -107,7 +107,7 @@ def premises_of(
 def _connected(
     relations: list[tuple[tuple[str, ...], TimedRelation]],
 ) -> list[tuple[tuple[str, ...], TimedRelation]]:
-    """Order relations so that each one shares a variable with an earlier one, if possible."""
+    """Sort tables of matches so that each table shares a variable with an earlier one, if possible."""
     found: list[tuple[tuple[str, ...], TimedRelation]] = []
     left = list(relations)
     while left:
@@ -118,14 +118,14 @@ def _connected(
 
 
 class _Ways:
-    """Search for the sets of queries that must have matches for a formula to have a given value."""
+    """Search for sets of queries. A formula has a value only if all queries of one set have matches."""
 
     def __init__(self, plan: CheckPlan) -> None:
         self._plan = plan
         self._tests: dict[str, Alternatives] = {}
 
     def ways(self, formula: Formula, *, value: bool) -> Alternatives:  # noqa: PLR0911 - a case each
-        """Return the sets of queries: the formula has the value only if all queries of one set have matches."""
+        """Return sets of queries. The formula has the value only if all queries of one set have matches."""
         match formula:
             case TruthConstant(value=constant):
                 return _ALWAYS if constant == value else _NEVER
@@ -154,7 +154,7 @@ class _Ways:
         return self._tests[name]
 
     def _tested(self, expression: b.Bound, test: Test) -> Alternatives:
-        """Return the sets of queries: the condition is true only if all queries of one set have matches."""
+        """Return sets of queries. The condition is true only if all queries of one set have matches."""
         if isinstance(expression, b.Operation) and expression.word == "AND":
             return _all([self._tested(one, test) for one in expression.operands])
         inputs = self._inputs(expression, test)
@@ -164,7 +164,7 @@ class _Ways:
         return _all([frozenset({needed}), frozenset(frozenset({one}) for one in inputs)])
 
     def _needed(self, expression: b.Bound, test: Test) -> Iterator[str]:
-        """Yield the queries that must have matches for an expression to have a known value."""
+        """Yield the queries that need matches, because without them the value of an expression is unknown."""
         if isinstance(expression, b.SignalCall) and expression.operand in test.signals:
             expression = expression.operand
         if expression in test.signals:
@@ -176,7 +176,7 @@ class _Ways:
                 yield from self._needed(operand, test)
 
     def _inputs(self, expression: b.Bound, test: Test) -> set[str] | None:
-        """Return the queries that a condition depends on. ``None`` if it can change without their matches."""
+        """Return the queries that a condition depends on; None if its value can change without any matches."""
         parts = set(b.walk(expression))
         calls = {part.operand for part in parts if isinstance(part, b.SignalCall)}
         names: set[str] = set()
@@ -197,7 +197,7 @@ class _Ways:
         return names | set(test.presence.values())
 
     def _holds_without(self, test: Test) -> bool:
-        """True if a condition is true even if none of its queries has matches."""
+        """True if a condition over several frames is true in case none of its queries has matches."""
         asks, two = self._plan.asks, np.arange(2)
         clock = Clock(two * _LONG, two * 0, _LONG)
         relations = {name: no_rows(ask) for name, ask in asks.items()}
@@ -220,7 +220,7 @@ def _any(parts: Sequence[Alternatives]) -> Alternatives:
 
 
 def _all(parts: Sequence[Alternatives]) -> Alternatives:
-    """Combine alternatives: each result is the union of one set from each part. Too large parts are skipped."""
+    """Combine lists of sets: each result joins one set of each list. Lists that are too long are skipped."""
     found = _ALWAYS
     for part in sorted(parts, key=len):
         if len(found) * len(part) <= MOST:
@@ -229,7 +229,7 @@ def _all(parts: Sequence[Alternatives]) -> Alternatives:
 
 
 def _fewest(sets: Iterable[frozenset[str]]) -> Alternatives:
-    """Return the sets that contain no other set of the list."""
+    """Return the smallest sets: those that contain no other set of the list."""
     found: list[frozenset[str]] = []
     for one in sorted(sets, key=len):
         if not any(other <= one for other in found):

@@ -1,4 +1,4 @@
-"""Formula progression: after each frame, the formula that the remaining frames must satisfy."""
+"""Formula progression: after each frame, compute the formula that the later frames must satisfy."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 
 class Term:
-    """Obligations of a temporal formula (conditions on later frames), joined by logic.
+    """Obligations of a temporal formula (conditions on later frames): one, or several joined by logic.
 
     Equal terms are one object.
 
@@ -86,7 +86,7 @@ class Term:
             self.begins = tuple(since for operand in operands for since in operand.begins)
 
     def bounds(self) -> Iterator[tuple[Bound, int]]:
-        """Yield the time bounds that have started in these obligations, each with its start time or frame."""
+        """Yield each time bound in these obligations that has begun, with its start as time or frame number."""
         if self.word == "duty":
             if self.timed:
                 yield self.operands[0].bound, self.operands[1]
@@ -95,7 +95,7 @@ class Term:
                 yield from operand.bounds()
 
     def implies(self, other: Term) -> bool:
-        """True if these obligations imply other ones that differ only in when their time bounds started."""
+        """True if these obligations imply ``other``, which differs only in the start of time bounds."""
         pairs = zip(self.begins, other.begins, strict=True)
         return all((a <= b) if self.sense > 0 else (a >= b) for a, b in pairs)
 
@@ -116,7 +116,7 @@ class Term:
 
 
 def may_end(term: Term, tick: Tick, *, due: bool = True) -> bool:
-    """True if obligations (conditions on later frames) are fulfilled or still open when the trace ends.
+    """True if no obligation (condition on later frames) fails because the trace ends.
 
     A forward operator is open if its bound is not over, and so is ``NEXT``. An operator without an upper bound
     has failed.
@@ -154,7 +154,7 @@ def _is_open(duty: Term, tick: Tick) -> bool:
 
 
 class Terms:
-    """Table of all obligations (conditions on later frames) in use. Equal ones are stored once."""
+    """Table of all obligations (conditions on later frames). Each different one is stored once."""
 
     def __init__(self) -> None:
         self._known: WeakValueDictionary[tuple[Any, ...], Term] = WeakValueDictionary()
@@ -172,11 +172,11 @@ class Terms:
         return term
 
     def constant(self, value: bool) -> Term:  # noqa: FBT001 - it is the value
-        """Return the obligation (condition on later frames) that is always true, or always false."""
+        """Return the obligation (condition on later frames) that is always true, or the always false one."""
         return self.true if value else self.false
 
     def duty(self, formula: Formula, since: int | None, *, weak: bool) -> Term:
-        """Return the obligation that a formula is true from the next frame on.
+        """Return the obligation "the formula is true from the next frame on".
 
         ``since`` is the start of its time bound, if begun.
 
@@ -193,7 +193,7 @@ class Terms:
         return self._made("not", (term,), (id(term),))
 
     def joined(self, word: str, terms: Iterable[Term]) -> Term:
-        """Return obligations (conditions on later frames) joined by ``and`` or ``or``, without redundant ones.
+        """Join obligations (conditions on later frames) by ``and`` or ``or``, and drop redundant ones.
 
         A term and its negation are not simplified; later frames decide them. The offline verdicts
         (:mod:`sgstore.temporal._verdicts`) do the same, and both must agree.
@@ -216,7 +216,7 @@ class Terms:
 
 
 def least(terms: Iterable[Term], word: str = "and") -> list[Term]:
-    """Return obligations joined by ``and`` or ``or``, without those that follow from others.
+    """Return the obligations that remain in an ``and`` or ``or`` if one that another implies is dropped.
 
     So a repeated obligation of an ``ALWAYS`` is stored once.
     """
@@ -275,7 +275,7 @@ class Progression:
 
     @property
     def untimed(self) -> bool:
-        """True if the temporal formula has no time bounds, so that frame times do not matter."""
+        """True if the temporal formula has no time bounds, so that it does not depend on frame times."""
         return not any(
             isinstance(p, Until | Since) and (p.bound.low or p.bound.high is not None)
             for p in walk(self.formula)
@@ -309,18 +309,18 @@ class Tick:
     tolerance: int = 0
 
     def begun(self, bound: Bound, age: int) -> bool:
-        """True if a duration (ns or frames) has reached the lower end of a time bound."""
+        """True if the time (ns or frames) since the start of a time bound has reached its lower end."""
         return age >= bound.low - (0 if bound.frames else self.tolerance)
 
     def over(self, bound: Bound, age: int) -> bool:
-        """True if a duration (ns or frames) has passed the upper end of a time bound."""
+        """True if the time (ns or frames) since the start of a time bound has passed its upper end."""
         if bound.high is None:
             return False
         return age > bound.high + (0 if bound.frames else self.tolerance)
 
 
 class ProgressionFrame:
-    """Evaluation of a temporal formula at one frame of an online run.
+    """Evaluation of temporal formulas at one frame of an online run.
 
     Parameters
     ----------
@@ -347,7 +347,7 @@ class ProgressionFrame:
             self._entries.append(kept)
 
     def now(self, formula: Formula, since: int | None = None) -> Term:
-        """Return the conditions on later frames (obligations) under which a formula is true at this frame.
+        """Return the obligations (conditions on later frames) that make a formula true at this frame.
 
         ``since`` is the start of an *until* bound, by default here.
         """
@@ -394,7 +394,7 @@ class ProgressionFrame:
         return terms.joined("or", (right, terms.joined("and", (left, later))))
 
     def resolved(self, term: Term) -> Term:
-        """Return obligations from the previous frame, updated with the data of this frame."""
+        """Return earlier obligations after this frame: conditions that this frame decides are replaced."""
         if term not in self._resolved:
             self._resolved[term] = self._resolve(term)
         return self._resolved[term]
@@ -433,7 +433,7 @@ class ProgressionFrame:
     def _known_past(
         self, part: Since, entries: tuple[Entry, ...], right: Term
     ) -> tuple[Term, tuple[Entry, ...]]:
-        """Return the value and the memory of a *since* whose operands are known.
+        """Return the value of a *since* with known operands at this frame, and its memory.
 
         The memory is the list of frames in which the right operand was true.
         """
@@ -479,7 +479,7 @@ class ProgressionFrame:
         return self._tick.time - entry[0]
 
     def past(self) -> Past:
-        """Return the memory of the past operators (*previous*, *since*) for the next frame."""
+        """Return the values that the operators *previous* and *since* need at the next frame."""
         return tuple(
             (self.now(p.operand) if isinstance(p, Previous) else self._present[id(p)], entries)
             for p, entries in zip(self._parts, self._entries, strict=True)

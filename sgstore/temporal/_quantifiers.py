@@ -1,4 +1,4 @@
-"""Quantifiers of a check (``FORALL``, ``FORSOME``): their entities in a trace, and the combined values."""
+"""Quantifiers of a check (``FORALL``, ``FORSOME``): combinations of entities, and combined values."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ NEWCOMER: Final = -(1 << 60)
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """Combinations of entities for the variables of one quantifier and those outside it.
+    """Combinations of entities for one quantifier: its variables, and those of the quantifiers outside it.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class Level:
 
 
 def innermost(levels: Sequence[Level]) -> Keys:
-    """Return the combinations of entities for all variables of a check, (B, n).
+    """Return all combinations of entities for the variables of a check: one per row, (B, n).
 
     Without quantifiers, B is 1 and n is 0.
     """
@@ -63,7 +63,7 @@ def levels_of(
     apart: Ints | None,
     counts: Callable[[BoundQuantifier, tuple[str, ...], Keys], Bools],
 ) -> list[Level]:
-    """Return the combinations of entities for each quantifier.
+    """Return, for each quantifier of a check, its combinations of entities.
 
     Each level extends the combinations of the level before.
 
@@ -113,7 +113,7 @@ def levels_among(
     *,
     counts: Callable[[BoundQuantifier, tuple[str, ...], Keys], Bools],
 ) -> list[Level]:
-    """Return the combinations of entities for each quantifier, limited to some combinations of all variables.
+    """Return, for each quantifier, its part of the given combinations of entities.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ def levels_among(
 
 
 def newcomers(check: BoundCheck, domains: Mapping[str, Ints]) -> dict[str, Ints]:
-    """Return the entities of each variable. ``FORSOME`` variables get an additional future entity."""
+    """Return the entities of each variable. A ``FORSOME`` variable gets one more for entities yet to come."""
     some = [node for q in check.quantifiers if q.word == "FORSOME" for node in q.nodes]
     return {
         node: np.append(domain, NEWCOMER + some.index(node)) if node in some else domain
@@ -153,7 +153,7 @@ def newcomers(check: BoundCheck, domains: Mapping[str, Ints]) -> dict[str, Ints]
 def waits_for_newcomers(
     check: BoundCheck, levels: Sequence[Level], wider: Sequence[Level], codes: Codes
 ) -> bool:
-    """True if a false check can still become true, because ``FORSOME`` includes entities that appear later.
+    """True if a false check can still become true: a ``FORSOME`` may find an entity that appears later.
 
     Parameters
     ----------
@@ -174,14 +174,14 @@ def waits_for_newcomers(
 
 
 def may_wait(check: BoundCheck) -> bool:
-    """True if the settings of a check allow entities that appear later to make a false check true."""
+    """True if the settings of a check let entities that appear later make a false check true."""
     return check.end in {"bounded", "pending"} and any(
         q.word == "FORSOME" for q in check.quantifiers
     )
 
 
 def folded_values(levels: Sequence[Level], values: Array, most: int = 1) -> list[Array]:
-    """Combine the values of entity combinations, from the innermost quantifier to the outermost.
+    """Combine the values of entity combinations, quantifier by quantifier, innermost first.
 
     ``FORALL`` takes the minimum, ``FORSOME`` the maximum. Return the values of each level,
     outermost first.

@@ -58,7 +58,7 @@ MARGIN_CELLS: Final = 16
 
 @dataclass(frozen=True, slots=True)
 class Robustness:
-    """Robustness of a check on a trace (margin of the verdict), with the deciding condition and frame.
+    """Robustness of a check on a trace (margin of its verdict), and the condition and frame that decide.
 
     Attributes
     ----------
@@ -88,7 +88,7 @@ class Robustness:
 
 
 def apart_from_absence(found: Robustness, without: Callable[[], Robustness]) -> Robustness:
-    """Replace minus infinity, if an absent entity causes it, by the margin without absence (at most 0).
+    """If an absent entity makes the margin minus infinity, return the margin without the absence.
 
     The other margin is computed without absence, and at most 0.
 
@@ -108,7 +108,7 @@ def apart_from_absence(found: Robustness, without: Callable[[], Robustness]) -> 
 
 
 def margin_of(test: Test, column: Column, tolerance: int, unknown: float = -np.inf) -> Floats:
-    """Return the robustness margin (B, F) of a comparison. By default, an unknown value counts as false.
+    """Return the margin of a comparison, for each combination and frame, (B, F). Unknown counts as false.
 
     Parameters
     ----------
@@ -129,12 +129,12 @@ def margin_of(test: Test, column: Column, tolerance: int, unknown: float = -np.i
 
 
 def margin_of_flags(flags: Bools) -> Floats:
-    """Return the robustness margins of a condition without numbers: plus or minus infinity."""
+    """Return the margins of a condition without numbers: infinity if it is true, else minus infinity."""
     return np.where(flags, np.inf, -np.inf)
 
 
 def condition_text(plan: Plan, name: str) -> str:
-    """Return the text of the condition behind a named proposition."""
+    """Return the text of the condition that a proposition (name in a formula) represents."""
     name = base_name(name)
     meanings = plan.meanings if isinstance(plan, CheckPlan) else {}
     if name in meanings:
@@ -157,7 +157,7 @@ def margin_columns(
     tolerance: int,
     unknown: float = -np.inf,
 ) -> dict[str, Floats]:
-    """Return the robustness margins of the propositions in a formula: name → margins (B, F).
+    """Return the margins of each proposition (single-frame condition) of a formula: name → (B, F).
 
     Parameters
     ----------
@@ -183,7 +183,7 @@ def margin_columns(
 
 
 def least_values(plan: CheckPlan, always: Formula) -> dict[str, frozenset[str]]:
-    """Return the signals whose least values alone determine the robustness margin of ``ALWAYS p``.
+    """Return the values whose minimum alone determines the robustness margin of ``ALWAYS p``.
 
     Then each margin in p is the known value of a signal, and frames without its entities count in favour. The
     result is empty for any other p, because a frame with another value may decide.
@@ -226,7 +226,7 @@ def least_values(plan: CheckPlan, always: Formula) -> dict[str, frozenset[str]]:
 
 
 def _states_in(plan: CheckPlan, test: Test) -> Iterator[Ask]:
-    """Yield the queries whose values must be known for a test."""
+    """Yield the queries that provide the values for an expression over several frames."""
     for signal in test.signals.values():
         of, _ = plan.states.get(signal.name, (None, None))
         if of is not None:
@@ -234,7 +234,7 @@ def _states_in(plan: CheckPlan, test: Test) -> Iterator[Ask]:
 
 
 class MarginTable:
-    """Robustness margins of temporal formulas in one trace, from the margins of their propositions.
+    """Robustness margins of temporal formulas in one trace, computed from single-frame conditions.
 
     Parameters
     ----------
@@ -252,7 +252,7 @@ class MarginTable:
         self._known: dict[Formula, Floats] = {}
 
     def value(self, formula: Formula) -> Floats:
-        """Return the robustness margin (B, F) of a formula at each frame.
+        """Return the robustness margin of a formula for each node combination and frame, (B, F).
 
         The shape is (1, F) if all node combinations have the same margin.
         """
@@ -290,7 +290,7 @@ class MarginTable:
                 return until(sides, self.value(right)[:, ::-1], first, end)[:, ::-1]
 
     def _asked(self, formula: Until | Since) -> tuple[Places, Places]:
-        """Return, for each frame, the range of frames in an operator's time bound.
+        """For each frame, return the start and the end of an operator's time bound, as frames.
 
         The range is: first frame, and frame after the last.
         """
@@ -307,7 +307,7 @@ class MarginTable:
     # Deciding frames
 
     def decisive(self, formula: Formula, row: int, frame: int) -> tuple[str, int] | None:  # noqa: PLR0911
-        """Return the proposition and frame that decide the robustness margin of a formula, or None.
+        """Return the proposition that decides the margin of a formula, and its frame; or None.
 
         The first of several wins.
 
@@ -359,7 +359,7 @@ class MarginTable:
 
 
 def until(left: Floats | None, right: Floats, first: Places, end: Places) -> Floats:
-    """Return the robustness margin (B, F) of a temporal *until* at each frame.
+    """Return the margin of an *until* for each node combination and frame, (B, F).
 
     Parameters
     ----------
@@ -395,7 +395,7 @@ def _behind(values: Floats) -> Floats:
 
 
 def _unbounded(left: Floats, right: Floats) -> Floats:
-    """Return the robustness margin (B, F) of an *until* without time bound at each frame.
+    """Return the margin of an *until* without time bound, for each node combination and frame, (B, F).
 
     Each step is a clamp, and a sequence of clamps is a clamp. So blocks of frames are processed in parallel,
     then combined.

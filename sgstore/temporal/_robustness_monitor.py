@@ -91,7 +91,7 @@ def _best(margins: Margins, *, greatest: bool) -> Margins:
 
 
 def _best_so_far(margins: Margins, *, greatest: bool) -> Margins:
-    """Return the running maximum or minimum of robustness margins over frames, (N, B, V)."""
+    """For each frame, return the best margin so far: the maximum or minimum up to this frame."""
     values = margins["value"] if greatest else -margins["value"]
     new = np.ones(values.shape, np.bool_)
     new[1:] = values[1:] > np.maximum.accumulate(values, axis=0)[:-1]
@@ -112,7 +112,7 @@ def _constant(value: Any, shape: tuple[int, ...]) -> Margins:
 
 @dataclass(slots=True)
 class _Tape:
-    """Robustness margins of consecutive frames. They are stored as long as later margins need them.
+    """Robustness margins of recent frames. A margin stays as long as later margins need it.
 
     Attributes
     ----------
@@ -146,7 +146,7 @@ class _Tape:
 
 @dataclass(slots=True)
 class _Part:
-    """Part of a temporal formula, with its margins of the frames processed so far.
+    """Part of a temporal formula, with the robustness margins of the frames so far.
 
     Attributes
     ----------
@@ -175,16 +175,16 @@ class _Part:
     tape: _Tape = field(default_factory=lambda: _Tape(0, np.zeros((0, 1, 1), MARGIN)))
 
     def join(self, one: Margins, other: Margins) -> Margins:
-        """Return the margins of an ``OR`` of two operands. Under a negation, it is an ``AND``."""
+        """Return the margins of ``one OR other``. Under a negation, the operator becomes ``AND``."""
         return _better(one, other, greatest=self.positive)
 
     def meet(self, one: Margins, other: Margins) -> Margins:
-        """Return the margins of an ``AND`` of two operands. Under a negation, it is an ``OR``."""
+        """Return the margins of ``one AND other``. Under a negation, the operator becomes ``OR``."""
         return _better(one, other, greatest=not self.positive)
 
     @property
     def nothing(self) -> float:
-        """Margin of an always false condition. Under a negation, the margin of an always true condition."""
+        """Margin of an always false condition: minus infinity; plus infinity under a negation."""
         return -np.inf if self.positive else np.inf
 
 
@@ -274,7 +274,7 @@ class MarginStream:
     # Online, frame by frame
 
     def step(self, columns: Mapping[str, Floats], tick: Tick, parents: Ints) -> None:
-        """Update the margins of the formula with the data of the next frame.
+        """Update the margins of the formula with the next frame.
 
         Parameters
         ----------
@@ -299,7 +299,7 @@ class MarginStream:
         self._forget()
 
     def margins(self) -> Margins:
-        """Return the robustness margins (B,) if the trace ends now, with dtype :data:`MARGIN`."""
+        """Return the margin of each node combination if the trace ended now."""
         return copy(self)._finished()  # noqa: SLF001 - of one's own kind
 
     def name(self, number: int) -> str:
@@ -307,7 +307,7 @@ class MarginStream:
         return self._names[number]
 
     def _finished(self) -> Margins:
-        """End the trace, and return its robustness margins (B,). No further frame is possible."""
+        """End the trace, and return the margin of each node combination. No frame may follow."""
         self._parts = [replace(part, tape=copy(part.tape)) for part in self._parts]
         self._ended = True
         self._advance()
@@ -325,7 +325,7 @@ class MarginStream:
                 self._answer = part.tape.at(0)
 
     def _replace(self, bit: int, value: Margins) -> None:
-        """Replace an unknown margin by its value in all stored results, when the next frame provides it."""
+        """When the next frame provides a margin, put it into all results that used the unknown margin."""
         low, high = self._vertices & ~bit, self._vertices | bit
 
         def shown(old: Margins) -> Margins:
@@ -341,7 +341,7 @@ class MarginStream:
         return _constant(value, (self._rows, len(self._vertices)))
 
     def _here(self, name: str, *, positive: bool) -> Margins:
-        """Return the margins of one proposition of the formula in this frame."""
+        """Return the margins of one single-frame condition of the formula in this frame."""
         found = self._all(0.0)
         column = self._columns[name][:, None]
         found["value"] = column if positive else -column
@@ -350,7 +350,7 @@ class MarginStream:
         return found
 
     def _told(self, part: _Part) -> Iterator[Margins]:
-        """Yield the margins of a part of the formula that become known with this frame, frame by frame."""
+        """Yield the margins of part of the formula that this frame makes known, frame after frame."""
         match part.formula:
             case TruthConstant(value=value):
                 if not self._ended:
@@ -444,7 +444,7 @@ class MarginStream:
             yield _best(found, greatest=part.positive)
 
     def _window_ahead(self, at: int, bound: Bound, *, single: bool) -> tuple[int, int] | None:
-        """Return the range of later frames in a time bound: first frame, and frame after the last.
+        """Return the first later frame in a time bound, and the frame after the last one.
 
         ``None`` means that a later frame decides.
         """
@@ -486,7 +486,7 @@ class MarginStream:
             yield _best(found, greatest=part.positive)
 
     def _window_back(self, at: int, bound: Bound, *, single: bool) -> tuple[int, int]:
-        """Return the first and last earlier frame in a time bound. -1 means before the trace."""
+        """Return the first and the last earlier frame in a time bound. -1 means before the trace."""
         bound = bound.widened(self._tolerance)
         if bound.frames:
             last = max(at - bound.low, -1)
@@ -606,7 +606,7 @@ class RobustnessMonitor:
         return next(self._rows[one] for one in wider if one in self._rows)
 
     def told(self, levels: Sequence[Level], names: Mapping[str, Mapping[int, str]]) -> Robustness:
-        """Return the robustness of the check if the trace ends now.
+        """Return the robustness of the check if the trace ended now.
 
         Parameters
         ----------

@@ -66,7 +66,7 @@ RunsTold = tuple["Ints", "Ints", "Keys", list[list[Any]]]
 
 @dataclass(frozen=True)
 class FrameLine:
-    """Frames of many traces in one array, with their times.
+    """Frames of many traces, concatenated into one array, with their times.
 
     Frames come from the buckets of a store, 60 at a time. Times are read on demand.
 
@@ -99,7 +99,7 @@ class FrameLine:
     def read(
         cls, file: StoreFile, about: Mapping[int, tuple[Any, ...]], window: Window | None
     ) -> FrameLine:
-        """Return the frames of the traces in a window. ``about`` is the result of :func:`chosen_traces`."""
+        """Return the frames of a window of several traces. ``about`` comes from :func:`chosen_traces`."""
         buckets = buckets_of(file, window)
         owners = buckets["bucket"] >> BUCKET_BITS
         rows = np.isin(owners, [*about])
@@ -143,7 +143,7 @@ class FrameLine:
         return found
 
     def places(self, ids: Ints) -> Ints:
-        """Return the array index of each frame id, shape (R,). -1 means not present."""
+        """Return the array index of each frame id, shape (R,). -1 if the frame is not present."""
         return places_of(ids, self.ids, self.traces, self.starts)
 
 
@@ -194,7 +194,7 @@ class BindingRows:
         return found.only(~again) if again.any() else found
 
     def only(self, rows: Bools) -> BindingRows:
-        """Return the table of matches limited to the selected rows."""
+        """Return a copy of the table with only the selected rows."""
         owners = np.cumsum(self.fresh)[rows]
         fresh = np.diff(owners, prepend=0) != 0
         values = {name: _rows(value, rows) for name, value in self.values.items()}
@@ -205,12 +205,12 @@ class BindingRows:
 
     @cached_property
     def starts(self) -> Ints:
-        """Index of the first row of each run. A run has consecutive frames and the same nodes."""
+        """Index of the first row of each run: a series of rows with consecutive frames and the same nodes."""
         follows = np.diff(self.frames, prepend=-2) == 1
         return np.flatnonzero(self.fresh | ~follows | self.line.begins[self.frames])
 
     def held(self, hold: b.BoundHold) -> BindingRows:
-        """Return the table limited to runs (consecutive frames with the same nodes) of a required duration."""
+        """Return a copy with only those runs (same nodes in consecutive frames) that last long enough."""
         if not len(self):
             return self
         counts = np.diff(self.starts, append=len(self))
@@ -225,7 +225,7 @@ class BindingRows:
 
 
 class RowValues(SignalValues):
-    """Values of expressions over several frames, as columns (1, R): one value for each row of frame and nodes.
+    """Values of expressions over several frames, for the rows of a table of matches, (1, R).
 
     Parameters
     ----------
@@ -238,12 +238,12 @@ class RowValues(SignalValues):
         self._rows = rows
 
     def signal(self, signal: Ask) -> Column:
-        """Return the values (1, R) of a single-frame query, one for each row of frame and nodes."""
+        """Return the value of a single-frame query in each row of the table, (1, R)."""
         assert signal.value is not None  # noqa: S101 - it is no atom
         return self._rows.values[signal.value]
 
     def course(self, course: b.SignalCall, test: Test) -> Column:
-        """Return the values (1, R) of a function over a time window, such as ``avg_over(x, 2s)``."""
+        """Return the value of a function over a time window, such as ``avg_over(x, 2s)``, in each row."""
         column = self.signal(test.signals[course.operand])
         first = self.window_starts(course)
         if course.word in {"sum_over", "avg_over"}:
@@ -253,7 +253,7 @@ class RowValues(SignalValues):
         return over_columns(course.word, column, first)
 
     def window_starts(self, course: b.SignalCall) -> Ints:
-        """Return, for each row, the first row of the time window that ends there, shape (R,)."""
+        """For each row, return the first row of the time window that ends at it, shape (R,)."""
         rows, line = self._rows, self._rows.line
         here = np.arange(len(rows))
         stretch = np.cumsum(line.begins)[rows.frames]
@@ -309,7 +309,7 @@ class RunFinder:
         self._window_nodes = frozenset(ask.variables) if bare else None
 
     def fits(self, places: Sequence[b.Bound]) -> bool:
-        """True if one query can provide both the matches and the returned values."""
+        """True if a single query can return both the matches and the values in ``RETURN``."""
         step = self._query.steps[0]
         if self._query.spans or step.absent or self._query.gaps != "break" or self._ask.everywhere:
             return False
@@ -336,7 +336,7 @@ class RunFinder:
         return chosen_traces(self._file, self._query, self._catalog)
 
     def found(self, places: Sequence[b.Bound], within: Window | None) -> Iterator[RunsTold]:
-        """Yield the runs (consecutive matching frames) of whole traces, in portions that fit into memory.
+        """Yield the runs (consecutive matching frames) of whole traces, split into portions for the memory.
 
         Parameters
         ----------
@@ -385,7 +385,7 @@ class RunFinder:
         return self._parts(rows, told), many
 
     def _parts(self, rows: BindingRows, told: list[Any]) -> RunsTold:
-        """Return first and last frame, nodes and values of each run.
+        """Return the first frame, last frame, nodes and values of each run of matching frames.
 
         A run ends where a returned value changes or a frame id is skipped.
         """
@@ -400,7 +400,7 @@ class RunFinder:
         return ids[first], ids[last], rows.keys[first], values
 
     def _projected(self, rows: BindingRows) -> BindingRows:
-        """Return the table of matches with only the node columns that the query returns."""
+        """Return a copy of the table of matches with only the node columns that the query returns."""
         if self._named == self._ask.columns:
             return rows
         columns = [self._ask.columns.index(name) for name in self._named]
@@ -408,7 +408,7 @@ class RunFinder:
         return BindingRows.of(rows.line, ids, rows.keys[:, columns], rows.values)
 
     def _read(self, tests: Collection[Test], window: Window | None) -> BindingRows:
-        """Return the table of the pattern's matches in a window, with the values that some expressions need."""
+        """Return the matches of the pattern in a window, with the values that some expressions need."""
         signals = (signal.value for test in tests for signal in test.signals.values())
         asked = list(dict.fromkeys(value for value in signals if value is not None))
         line = FrameLine.read(self._file, self._about, window)
@@ -428,7 +428,7 @@ def _values(place: b.Bound) -> tuple[b.Bound, ...]:
 
 
 def _column(told: Any) -> Column:
-    """Return a database column as a column of values and mask of known values, shape (1, R)."""
+    """Return a column read from the database as values and a mask of the known ones, shape (1, R)."""
     values, known = np.ma.getdata(told), ~np.ma.getmaskarray(told)
     if values.dtype.kind in "iuf":
         values = values.astype(np.float64)
@@ -446,7 +446,7 @@ def _whole(column: Column, rows: int) -> Column:
 
 
 def _earliest(at: Ints, limit: Ints, low: Ints, high: Ints) -> Ints:
-    """Return the first index between ``low`` and ``high`` at which the ascending ``at`` reaches a limit."""
+    """For each row, return the first index in its range at which the sorted ``at`` reaches the limit."""
     low, high = low.copy(), high.copy()
     while np.any(low < high):
         middle = (low + high) // 2
@@ -456,7 +456,7 @@ def _earliest(at: Ints, limit: Ints, low: Ints, high: Ints) -> Ints:
 
 
 def _one_by_one(word: str, values: Any, known: Bools, first: Ints) -> Column:
-    """Return exact sums or means of the known values in the time window of each row."""
+    """For each row, return the exact sum or mean of the known values in its time window."""
     count = np.concatenate(([0], np.cumsum(known)))
     some = values[known].tolist()
     ends = zip(count[first].tolist(), count[1:].tolist(), strict=True)

@@ -41,7 +41,7 @@ Needs = bool | tuple[tuple[Partial, Term], ...]
 
 @dataclass(slots=True)
 class Run:
-    """Consecutive frames without a gap in which a sequence step matches.
+    """Series of consecutive frames without a gap in which a sequence step matches.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ class StepFrame:
 
     @property
     def ends(self) -> tuple[int, ...]:
-        """Numbers of the frame, and of the first and last frame of its run.
+        """Numbers of three frames: this one, and the first and last of its run of matching frames.
 
         The last frame is absent while the run continues.
         """
@@ -86,7 +86,7 @@ class StepFrame:
 
 
 class StepState:
-    """State of one sequence step for one combination of nodes: its matching and undecided frames.
+    """State of a sequence step for one combination of nodes: frames that match, and undecided frames.
 
     Parameters
     ----------
@@ -117,25 +117,25 @@ class StepState:
 
     @property
     def idle(self) -> bool:
-        """True if the step has no stored frame and no current run, so that its state can be deleted."""
+        """True if the state can be deleted: it has no stored frame and no current run of frames."""
         return not (self.places or self._queue or self._run)
 
     @property
     def oldest(self) -> int:
-        """First frame of the stored or undecided runs of the step. :data:`NEVER` means no frame."""
+        """Number of the oldest frame that the state still needs; :data:`NEVER` without a frame."""
         runs = [place.run.number for place in self.places[:1]]
         runs += [self._run.number] if self._run is not None else []
         return min([*runs, self.undecided])
 
     @property
     def undecided(self) -> int:
-        """Number of the first frame in which the step is undecided. :data:`NEVER` means no frame."""
+        """Number of the first frame without a decision if the step matches; :data:`NEVER` without one."""
         if self._waiting:
             return self._waiting[0].number
         return self._queue[0][0] if self._queue else NEVER
 
     def frames(self) -> Iterator[int]:
-        """Yield the numbers of the stored frames of the step, decided or not, and of the ends of their runs."""
+        """Yield the numbers of the stored frames of the step, and of the ends of their runs of frames."""
         for place in (*self.places, *self._waiting):
             yield from place.ends
         if self._run is not None:
@@ -143,12 +143,12 @@ class StepState:
         yield from (number for number, _, _ in self._queue)
 
     def ask(self, holds: Needs, *, gap: bool) -> None:
-        """Add the next frame in which the step may match. ``holds`` are the conditions that are still open."""
+        """Add the next frame in which the step may match. ``holds``: conditions that later frames decide."""
         self._queue.append((self._pulse.tick.number, self._pulse.tick.time, gap))
         self.open.append(holds)
 
     def decide(self, needs: list[Needs]) -> None:
-        """Decide the open frames of the step whose conditions have become known."""
+        """Decide, for waiting frames, if the step matches there. ``needs`` are their updated conditions."""
         self.open = deque(needs)
         while self.open and isinstance(self.open[0], bool):
             number, time, gap = self._queue.popleft()
@@ -175,7 +175,7 @@ class StepState:
         self._waiting = []
 
     def _long(self) -> bool:
-        """True if the current run of matching frames has the required duration."""
+        """True if the current run of matching frames is as long as the step requires."""
         if self._hold is None:
             return True
         last = self._waiting[-1]
@@ -193,7 +193,7 @@ class StepState:
         self._run = None
 
     def finish(self) -> None:
-        """End the trace: decide all open frames of the step."""
+        """End the trace: decide for each waiting frame if the step matches there."""
         self.decide([n if isinstance(n, bool) else any(t.ended for _, t in n) for n in self.open])
         self._end()
 
@@ -203,7 +203,7 @@ Binding = dict[str, int]
 
 
 def joined(one: Binding, names: tuple[str, ...], key: Key, apart: frozenset[str]) -> Binding | None:
-    """Merge the nodes of two matches. ``None`` means a conflict, or two equal nodes that must differ."""
+    """Merge the nodes of two matches. Return None if they conflict, or use a node twice that must differ."""
     both = dict(one)
     for name, node in zip(names, key, strict=True):
         known = both.get(name)
@@ -355,7 +355,7 @@ class SequenceMonitor:
         return self._found(here)
 
     def _now(self, number: int) -> dict[Key, Needs]:
-        """Return the matches of a step's pattern in this frame: nodes → True, or conditions still open."""
+        """Return the matches of a step in this frame: nodes → True, or the conditions still open."""
         question, variables = self._asks[number]
         places = [variables.index(name) for name in self._columns[number]]
         answers = self._questions.answers[question]
@@ -396,7 +396,7 @@ class SequenceMonitor:
         return found
 
     def _certain(self) -> Iterator[FoundMatch]:
-        """Yield the matches of the sequence that are certain with the data of this frame."""
+        """Yield the matches of the sequence that became certain with this frame."""
         (way,) = self._asked
         if all(self._held[number] for number in self._happen[way]):
             for binding in self._bindings({}, self._happen[way]):
@@ -405,7 +405,7 @@ class SequenceMonitor:
 
     @cached_property
     def _lasting(self) -> dict[StepWay, frozenset[int]]:
-        """Positions of the steps whose run of frames must end before a match is reported, by alternative."""
+        """For each alternative, the steps whose run of frames must end before a match is reported."""
         return {way: frozenset(self._lasting_in(happen)) for way, happen in self._happen.items()}
 
     def _lasting_in(self, happen: tuple[int, ...]) -> Iterator[int]:
@@ -418,7 +418,7 @@ class SequenceMonitor:
             yield len(happen) - 1
 
     def _frames(self) -> Iterator[int]:
-        """Yield the numbers of the stored frames at which a step of a match can begin or end."""
+        """Yield the numbers of the stored frames at which a step can begin or end in a match."""
         for number in frozenset[int]().union(*self._happen.values()):
             for one in self._held[number].values():
                 yield from one.frames()
@@ -427,7 +427,7 @@ class SequenceMonitor:
                 yield from place.ends
 
     def _bindings(self, binding: Binding, steps: Sequence[int]) -> Iterator[Binding]:
-        """Yield the combinations of nodes for which every step of the sequence has matching frames."""
+        """Yield the combinations of nodes with which every step of the sequence has matching frames."""
         if not steps:
             yield binding
             return
@@ -438,7 +438,7 @@ class SequenceMonitor:
                     yield from self._bindings(both, steps[1:])
 
     def _agreeing(self, number: int, binding: Binding) -> list[tuple[Key, StepState]]:
-        """Return the node combinations of a step that agree with the given nodes, each with its state."""
+        """Return the node combinations of a step that agree with the given nodes, and the state of each."""
         names, held = self._columns[number], self._held[number]
         if all(name in binding for name in names):
             key = tuple(binding[name] for name in names)
@@ -471,7 +471,7 @@ class SequenceMonitor:
         return self._held[number].get(tuple(binding[name] for name in self._columns[number]))
 
     def _ways(self, way: StepWay, at: int, place: StepFrame, binding: Binding) -> Ways:
-        """Return the frames of the remaining steps of a sequence after a given frame, if known and allowed."""
+        """Return the frames of the remaining steps, this frame first; ``OPEN`` if later frames decide."""
         steps, following = way.steps, at + 1
         if following == len(steps):
             return (place,)
@@ -503,7 +503,7 @@ class SequenceMonitor:
     def _reached(
         self, place: StepFrame, link: StepLink, held: StepState | None, stop: int
     ) -> list[StepFrame]:
-        """Return the frames of the next step that its time relation to the previous step allows."""
+        """Return the frames of the next step that meet its time relation to the previous step."""
         found = [p for p in held.places if p.number <= stop] if held is not None else []
         first = place.number
         match link.kind:
@@ -558,7 +558,7 @@ class SequenceMonitor:
         return (place,) if self._closed(place, plain, absent, NEVER) else OPEN
 
     def _events(self, found: FoundMatch, here: FrameTime) -> Iterator[MonitorEvent]:
-        """Yield the event of a match, if ``HAVING`` keeps it."""
+        """Yield the event that reports a match, unless its ``HAVING`` condition is false."""
         way, binding, places = found
         happen = self._happen[way]
         steps = tuple(self._moment(place) for place in places)
@@ -587,7 +587,7 @@ class SequenceMonitor:
     def _span(
         self, part: OverMatch, happen: tuple[int, ...], ways: tuple[StepFrame, ...]
     ) -> tuple[int, int]:
-        """Return the first and last frame of a match, or of the steps in an ``OVER`` clause."""
+        """Return the first and last frame of a match, or of its steps in an ``OVER`` clause."""
         if part.start == AT_FRAME:
             return ways[-1].number, ways[-1].number
         if part.start is None or part.end is None:
@@ -625,7 +625,7 @@ class SequenceMonitor:
                     one.places.pop(0)
 
     def _oldest(self, number: int) -> tuple[dict[Key, int], list[int]]:
-        """Return the first frame at which a match can begin, for each combination of shared nodes.
+        """For each combination of shared nodes, return the first frame at which a match can begin.
 
         The nodes are those of the first step and a given step.
 
@@ -658,7 +658,7 @@ class SequenceMonitor:
     def _alive(  # noqa: PLR0911 - a case each
         self, way: StepWay, at: int, binding: Binding, place: StepFrame
     ) -> bool:
-        """True if later frames can still continue a sequence after the given frame."""
+        """True if a later frame can still continue a sequence after the given frame."""
         following, steps = at + 1, way.steps
         if following == len(steps):
             return False
@@ -684,7 +684,7 @@ class SequenceMonitor:
         return False
 
     def finish(self, here: FrameTime) -> list[MonitorEvent]:
-        """End the trace, and return the events of the sequence that only the end decides."""
+        """End the trace, and return the events that are certain only then."""
         self._ended = True
         for held in self._held:
             for one in held.values():
@@ -693,7 +693,7 @@ class SequenceMonitor:
 
 
 def _returned(query: Query) -> list[ReturnColumn]:
-    """Return the ``RETURN`` columns that use several frames of a match. Queries with aggregates have none."""
+    """Return the ``RETURN`` columns that depend on several frames; none if the query has aggregates."""
     if query.result.aggregated:
         return []
     return [
@@ -712,7 +712,7 @@ def _named(query: Query) -> tuple[str, ...]:
 
 
 def _within(link: StepLink, place: StepFrame, other: StepFrame, tolerance: int) -> bool:
-    """True if the delay between two frames meets the time relation of two steps; tolerance in ns."""
+    """True if the time from one frame to another meets the time relation of two steps."""
     later = {True: other.number - place.number, False: other.time - place.time}
     slack = {True: 0, False: tolerance}
     after, within = link.after, link.within
@@ -722,7 +722,7 @@ def _within(link: StepLink, place: StepFrame, other: StepFrame, tolerance: int) 
 
 
 class _Conditions:
-    """Conditions of sequence steps that depend on several frames."""
+    """Conditions of sequence steps whose value depends on several frames."""
 
     def __init__(
         self, query: Query, steps: Sequence[BoundStep], questions: QueryCache, pulse: StreamClock
@@ -763,15 +763,15 @@ class _Conditions:
         known.keep(entries, lambda one, other: one == other)
 
     def row(self, nodes: Binding) -> Partial:
-        """Return the nodes of a match in the order of the variables in the conditions."""
+        """Return the nodes of a match in the order of the variables of the conditions."""
         return tuple(nodes.get(name) for name in self._variables)
 
     def now(self, number: int, row: Partial) -> Term:
-        """Return the open conditions of a step for given nodes in this frame."""
+        """Return the conditions on later frames under which a step matches with these nodes in this frame."""
         return self._frame(row).now(self._when[number])
 
     def resolved(self, needs: Needs) -> Needs:
-        """Return the open conditions of an earlier frame, updated with the data of this frame."""
+        """Return the open conditions of an earlier frame, after this frame has decided some of them."""
         if isinstance(needs, bool):
             return needs
         return settled([(row, self._frame(row).resolved(term)) for row, term in needs])
@@ -782,7 +782,7 @@ class _Conditions:
 
 
 def settled(needs: list[tuple[Partial, Term]]) -> Needs:
-    """Return True if one open condition is true, False if none can become true, otherwise the open ones."""
+    """Return True if a condition is true, False if all are false, otherwise those not decided yet."""
     if any(term.word == "true" for _, term in needs):
         return True
     left = tuple((row, term) for row, term in needs if term.word != "false")
@@ -835,7 +835,7 @@ class ExpressionMonitor(SequenceMonitor):
         return way.steps[0], told, run
 
     def _see(self, way: StepWay, binding: Binding) -> None:
-        """Record the matches of one alternative sequence, for given nodes.
+        """Find the matches of one alternative sequence with given nodes, and keep the best of each start.
 
         Only the best match of each start is kept.
         """
@@ -865,7 +865,7 @@ class ExpressionMonitor(SequenceMonitor):
         return (frames, place) < (known, written)
 
     def _decided(self, group: _Group, found: FoundMatch) -> bool:
-        """True if no later match can be preferred to this match."""
+        """True if a match is final: no later match can be preferred to it."""
         step, told, run = group
         bound, frames = dict(zip(self._named, told, strict=True)), _frames(found)
         for way in self._asked:
@@ -898,7 +898,7 @@ class ExpressionMonitor(SequenceMonitor):
     def _may_be_earlier(
         self, standing: _Standing, frames: tuple[int, ...], *, before: bool
     ) -> bool:
-        """True if an incomplete match can still be completed with earlier frames than the given frames."""
+        """True if an incomplete match can still be completed with frames before the given ones."""
         way, at, binding, place = standing
         if at == len(way.links):
             return False  # an ended match is already known
@@ -973,7 +973,7 @@ class ExpressionMonitor(SequenceMonitor):
                 one.places = [p for p in one.places if p.number >= low or id(p) in own_ids]
 
     def _since(self, first: int, n: int, key: Key, begun: dict[int, dict[Key, int]]) -> int:
-        """Return the first frame at which a match with this step and these nodes can begin."""
+        """Return the first frame at which a match can begin that contains this step with these nodes."""
         names, columns = self._columns[first], self._columns[n]
         own = {name: node for name, node in zip(columns, key, strict=True) if name in names}
         places = [(names.index(name), node) for name, node in own.items()]
@@ -985,7 +985,7 @@ class ExpressionMonitor(SequenceMonitor):
         return min(found, default=NEVER)
 
     def _followed(self, n: int, key: Key, places: list[StepFrame]) -> list[StepFrame]:
-        """Return the stored frames of a first step with which a later match can begin."""
+        """Return the stored frames of a first step at which a later match can begin."""
         binding = dict(zip(self._columns[n], key, strict=True))
         ways = [way for way in self._asked if way.steps[0] == n]
         found: list[StepFrame] = []
@@ -998,7 +998,7 @@ class ExpressionMonitor(SequenceMonitor):
         return found
 
     def _open_ended(self, way: StepWay) -> bool:
-        """True if the first step needs only the first frame of each run: the next step has no time limit.
+        """True if only the first frame of each run of the first step counts, as the next step has no limit.
 
         A run is a series of frames in which the step matches.
         """

@@ -1,4 +1,4 @@
-"""Search for sequences in a store. The matches of the steps are joined over time, as arrays."""
+"""Search for sequences in a store. It joins the matches of the steps over time, with arrays."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Leg:
-    """Time relation from one sequence step to the next one, with the frames of the next and absent steps.
+    """Time relation of two sequence steps, with the frames of the second step and of the step between.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class Leg:
 
 
 class BindingLine:
-    """Frames of many node combinations on one line: frame i of combination b is at position ``b * stride + i``.
+    """Numbering of frames: frame i of node combination b has the position ``b * stride + i``.
 
     Parameters
     ----------
@@ -105,11 +105,11 @@ class BindingLine:
         ]  # before the clock jumps
 
     def frame(self, places: Ints) -> Ints:
-        """Return the frame number of each position on the line."""
+        """Return the frame number of each position. See the class for positions."""
         return places % self.stride
 
     def run_ends(self, places: Ints) -> Ints:
-        """Return the last position of the run (consecutive frames) of each ascending position, shape (R,)."""
+        """Return, for each position, the last one of its run (consecutive frames), shape (R,)."""
         if not len(places):
             return places
         last = np.append(self._starts(places)[1:], True)
@@ -117,7 +117,7 @@ class BindingLine:
         return places[np.minimum.accumulate(ends[::-1])[::-1]]
 
     def run_starts(self, places: Ints) -> Ints:
-        """Return the first position of the run (consecutive frames) of each ascending position, shape (R,)."""
+        """Return, for each position, the first one of its run (consecutive frames), shape (R,)."""
         if not len(places):
             return places
         return places[
@@ -125,18 +125,18 @@ class BindingLine:
         ]
 
     def runs(self, places: Ints) -> Ints:
-        """Return the number of the run (consecutive frames) of each ascending position, shape (R,)."""
+        """Return, for each position, the number of its run (consecutive frames), shape (R,)."""
         return np.cumsum(self._starts(places)) - 1
 
     def _starts(self, places: Ints) -> Bools:
-        """Return a mask of the positions that start a run: after a missing frame, a gap, or other nodes."""
+        """Return a mask of the positions that start a run: they do not continue the position before."""
         starts = np.ones(len(places), np.bool_)
         follows = np.diff(places) == 1
         starts[1:] = ~follows | self._breaks[self.frame(places[1:])]
         return starts
 
     def held(self, places: Ints, hold: BoundHold) -> Ints:
-        """Return the positions whose run of consecutive frames has the required duration."""
+        """Return the positions in runs of consecutive frames that last as long as the step requires."""
         if not len(places):
             return places
         runs = self.runs(places)
@@ -152,7 +152,7 @@ class BindingLine:
         return places[hold.fits(length, tolerances)[runs]]
 
     def window(self, leg: Leg, places: Ints) -> tuple[Ints, Ints]:
-        """Return the first and last allowed position of the next step, for each position of a step."""
+        """For each position of a step, return the first and the last allowed position of the next step."""
         frame = self.frame(places)
         base = places - frame
         if leg.kind == "while":
@@ -176,7 +176,7 @@ class BindingLine:
         return low, high
 
     def _moved(self, frame: Ints, by: Length | None, side: str) -> Ints:
-        """Return, for each frame, the frame a given time later. ``by=None`` means without a limit.
+        """Return, for each frame, the frame that is later by a given duration. None means no limit.
 
         ``left`` means the first frame at or after it, ``right`` the last frame within it.
         """
@@ -196,7 +196,7 @@ class BindingLine:
 
 
 def matches_of(line: BindingLine, first: Ints, legs: Sequence[Leg], policy: str) -> Ints:
-    """Return the matches of a sequence: the position of each step on the line of frames.
+    """Return the matches of a sequence: for each match, the positions of its steps.
 
     Parameters
     ----------
@@ -234,7 +234,7 @@ def matches_of(line: BindingLine, first: Ints, legs: Sequence[Leg], policy: str)
 
 
 def _next(possible: Ints, low: Ints, high: Ints, *, latest: bool) -> tuple[Ints, Bools]:
-    """Return the earliest or latest possible position in each window, and a mask of non-empty windows."""
+    """Return the first or last possible position in each window, and a mask of non-empty windows."""
     if not len(possible):
         return low, np.zeros(len(low), np.bool_)
     if latest:
@@ -254,7 +254,7 @@ def _unfollowed(line: BindingLine, leg: Leg, places: Ints) -> Ints:
 
 
 def _one_a_run(line: BindingLine, first: Ints, possible: Ints) -> Ints:
-    """Return the first possible start position in each run (consecutive frames) of the first step."""
+    """Return the earliest possible position in each run (consecutive frames) of the first step."""
     runs = line.runs(first)[np.searchsorted(first, possible)] if len(possible) else possible
     return possible[np.diff(runs, prepend=-1) != 0] if len(possible) else possible
 
@@ -271,7 +271,7 @@ _Part = tuple["Ints", "Ints", "Keys", list[list[Any]]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MatchesOfWay:
-    """Matches of one alternative step sequence of a query, for some combinations of nodes.
+    """Matches of one alternative step sequence of a query.
 
     Attributes
     ----------
@@ -290,7 +290,7 @@ class MatchesOfWay:
     told: Ints
 
     def chosen(self, rows: Any) -> MatchesOfWay:
-        """Return only the given matches."""
+        """Return a copy with only the matches in the given rows."""
         return replace(self, told=self.told[rows])
 
 
@@ -368,7 +368,7 @@ class Finder:
         return any(len(part[0]) for part in self.found_in(TraceGroup.alone(trace), ()))
 
     def _found(self, group: TraceGroup, places: tuple[Bound, ...]) -> list[_Part]:
-        """Return the matches in a group of traces. If they are too many together, search trace by trace."""
+        """Return the matches in a group of traces. If there are too many, search each trace separately."""
         try:
             return [*self.found_in(group, places)]
         except QueryError:
@@ -454,7 +454,7 @@ class Finder:
     def _chosen(
         self, line: BindingLine, held: list[TimedRelation], found: list[MatchesOfWay]
     ) -> Iterator[MatchesOfWay]:
-        """Yield the preferred match for each combination of nodes and each run of the first step.
+        """Yield the best match for each combination of nodes and each run of the first step.
 
         A run is a series of consecutive frames.
 
@@ -497,16 +497,16 @@ class Finder:
         return self._tied if self._query.injective else frozenset()
 
     def _named(self, number: int) -> tuple[str, ...]:
-        """Return the node and edge columns of a step that other steps or the results use."""
+        """Return the node and edge columns of a step that other steps or the result need."""
         ask = self._steps[number]
         return (*(n for n in ask.variables if n in self._tied), *ask.edges)
 
     def _columns(self, number: int) -> tuple[str, ...]:
-        """Return the key columns of the table of a step: the trace, then the nodes and edges."""
+        """Return the key columns of a step's table: the trace, then the nodes and edges."""
         return TRACE, *self._named(number)
 
     def _held(self, group: TraceGroup, line: BindingLine, number: int) -> TimedRelation:
-        """Return the table of frames in which a step matches, with its pattern, conditions and duration."""
+        """Return the frames in which a step matches, as a table. Its conditions and duration are met."""
         step, ask = self._query.steps[number], self._steps[number]
         relation, names = group.relations[ask.name], (TRACE, *ask.columns)
         if self._when[number]:
@@ -526,7 +526,7 @@ class Finder:
     def _true(
         self, group: TraceGroup, relation: TimedRelation, ask: Ask, formulas: Sequence[Formula]
     ) -> Any:
-        """Return a mask of the rows of a table in which all given temporal formulas are true."""
+        """Return a mask of the rows of a table: true if all given temporal formulas are true."""
         true = np.zeros(len(relation.frames), np.bool_)
         for trace, part, low in _chunks(group, relation):
             bindings = part.keys[:, : len(ask.variables)]
@@ -597,7 +597,7 @@ class Finder:
         return owner * line.stride + relation.frames[rows]
 
     def _legs(self, way: StepWay, at: list[Ints], absent: dict[int, Ints]) -> list[Leg]:
-        """Return the time relations between the steps that must occur, with the frames of absent steps.
+        """Return the time relations between steps, without ``NOT MATCH`` steps, which become part of them.
 
         A ``NOT MATCH`` step becomes part of a time relation.
         """
@@ -616,7 +616,7 @@ class Finder:
     def _span(
         self, line: BindingLine, place: OverMatch, one: MatchesOfWay, ends: Ints
     ) -> tuple[Ints, Ints]:
-        """Return the first and last frame (M,) of the part of each match that an ``OVER`` clause covers."""
+        """For each match, return the first and last frame of the steps in an ``OVER`` clause, (M,)."""
         told, happen = one.told, one.happen
         if place.start is None or place.end is None:
             return line.frame(told[:, 0]), ends
@@ -687,7 +687,7 @@ def _whole(window: Window | None) -> Window | None:
 def _chunks(
     group: TraceGroup, relation: TimedRelation
 ) -> Iterator[tuple[TraceReader, TimedRelation, int]]:
-    """Yield parts of a table, each with one trace and few node combinations, and the first row of each part."""
+    """Yield parts of a table: each with one trace and few node combinations, and its first row."""
     for place in np.unique(relation.keys[:, 0]).tolist():
         trace, whole = group.reader(place), group.part(relation, place)
         begin = int(relation.starts[np.searchsorted(relation.keys[:, 0], place)])

@@ -209,7 +209,7 @@ def _matching(
 def _of_one_frame(
     file: StoreFile, matches: TemporalMatches, span: Span | None
 ) -> Iterator[ShortestClip]:
-    """Yield the first matching frame of each trace, or of a clip, as the shortest clip."""
+    """Yield a clip of one frame for each trace or clip: the first frame that matches."""
     low, high = (-1, (1 << 63) - 1) if span is None else (one.frame_id for one in span)
     found: dict[int, FrameRef] = {}
     for one in matches.frames():
@@ -234,7 +234,7 @@ def _looks_ahead(condition: Bound | None) -> bool:
 
 
 def _lasts(check: BoundCheck) -> bool:
-    """True if later frames and new entities cannot repair a violation of the check."""
+    """True if a violation of the check is final: no later frame or new entity can end it."""
     quantifiers = check.quantifiers
     return check.gaps != "unknown" and not any(
         q.word != "FORALL" or _looks_ahead(q.where) for q in quantifiers
@@ -242,7 +242,7 @@ def _lasts(check: BoundCheck) -> bool:
 
 
 def _stays(query: Query) -> bool:
-    """True if later frames cannot remove a match of the query."""
+    """True if a match of the query is final: no later frame can remove it."""
     return not any(
         step.absent
         or (step.hold is not None and step.hold.comparison not in {">", ">="})
@@ -252,7 +252,7 @@ def _stays(query: Query) -> bool:
 
 
 def _cut(trace: TraceReader, span: Span | None) -> TraceReader:
-    """Return a range of frames of a trace as a separate trace, or the whole trace."""
+    """Return a range of frames of a trace as a trace of its own, or the whole trace."""
     if span is None:
         return trace
     first, last = np.searchsorted(trace.frame_ids, [one.frame_id for one in span]).tolist()

@@ -1,4 +1,4 @@
-"""Temporal values of the online monitor (durations, changes, sums, means), updated frame by frame."""
+"""Functions over time in the online monitor (durations, changes, sums), updated frame by frame."""
 
 from __future__ import annotations
 
@@ -92,12 +92,12 @@ class SignalState:
 
     @property
     def begun(self) -> Memory:
-        """Memory of functions over time and past operators before the first frame."""
+        """Initial memory of functions over time and past operators, before the first frame."""
         pasts = (progression.begun for progression in self.conditions.values())
         return (*(None for _ in self.places), *pasts)
 
     def step(self) -> None:
-        """Add the next frame. The clock must contain the frame already."""
+        """Add the frame that the clock shows. The clock must be updated first."""
         tick = self.pulse.tick
         if self.gap:
             self._frames.clear()
@@ -117,7 +117,7 @@ class SignalState:
         return self._frames[0][1]
 
     def window(self, course: b.SignalCall) -> tuple[int, int]:
-        """Return number and time of the oldest frame in the time window of a function over time.
+        """Return number and time of the first frame in the time window of a function over time.
 
         An example is ``avg_over(x, 2s)``.
         """
@@ -127,7 +127,7 @@ class SignalState:
         return self._begun, tick.time - course.by - tick.tolerance
 
     def there(self, course: b.SignalCall) -> int:
-        """Return the number of the earlier frame with which ``delta(x, 2s)`` compares this frame, or -1."""
+        """Return the number of the earlier frame that ``delta(x, 2s)`` compares with this frame; or -1."""
         tick = self.pulse.tick
         if course.frames:
             number = tick.number - course.by
@@ -145,7 +145,7 @@ class SignalState:
         atom: Callable[[str], Bools],
         signal: Callable[[Ask], Column],
     ) -> tuple[dict[str, Column], list[Memory]]:
-        """Return the values of all expressions in this frame, and the memory of each binding.
+        """Return the values of all expressions in this frame, and the new memory of each binding.
 
         There is one of each for every node combination.
 
@@ -193,13 +193,13 @@ class _Now(SignalValues):
         self._rows = len(memories)
 
     def memories(self) -> list[Memory]:
-        """Return the memory for the next frame, for each combination of nodes."""
+        """Return the memory of each node combination for the next frame."""
         columns = [self._new[course] for course in self._all.places]
         columns += [self._kept[condition] for condition in self._all.conditions]
         return list(zip(*columns, strict=True)) if columns else [() for _ in range(self._rows)]
 
     def test(self, test: Test) -> Column:
-        """Return the values (B, 1) of an expression in this frame.
+        """Return the value of an expression in this frame for each node combination, (B, 1).
 
         They are computed once, because this changes the memory.
         """
@@ -208,25 +208,25 @@ class _Now(SignalValues):
         return self._tests[test.name]
 
     def signal(self, signal: Ask) -> Column:
-        """Return the values (B, 1) of a single-frame query in this frame."""
+        """Return the value of a single-frame query in this frame for each node combination, (B, 1)."""
         return self._signal(signal)
 
     def proposition(self, name: str) -> Bools:
-        """Return a mask (B, 1) of the node combinations for which a named condition is true in this frame."""
+        """Return a mask of the node combinations for which a named condition is true in this frame."""
         if name in self._all.plan.tests:
             found = self.test(self._all.plan.tests[name]).true
             return np.broadcast_to(found, (self._rows, 1))
         return self._atom(name)[:, None]
 
     def margins(self, course: b.SignalCall, test: Test) -> Floats:
-        """Return the robustness margins (B, 1) of a condition in this frame."""
+        """Return the robustness margin of a condition in this frame for each node combination, (B, 1)."""
         formula, tolerance = test.quantities[course.operand], self._tick.tolerance
         columns = margin_columns(self._all.plan, formula, self.test, self.proposition, tolerance)
         value = MarginTable(columns, np.zeros(1, np.int64)).value(formula)
         return np.broadcast_to(value, (self._rows, 1))
 
     def condition(self, expression: b.Bound, test: Test) -> Bools:
-        """Return a mask (B, 1) of the node combinations for which a condition is true in this frame.
+        """Return a mask of the node combinations for which a condition is true in this frame.
 
         It is true where the condition inside ``run_length(…)`` or similar is true in this frame.
         """
@@ -251,7 +251,7 @@ class _Now(SignalValues):
         return np.array([value for value, _ in found], np.bool_)
 
     def course(self, course: b.SignalCall, test: Test) -> Column:
-        """Return the values of a function over time, such as ``delta(x, 2s)``, in this frame."""
+        """Return the value of a function over time, such as ``delta(x, 2s)``, in this frame."""
         if course not in self._courses:
             self._courses[course] = self._course(course, test)
         return self._courses[course]
@@ -357,7 +357,7 @@ _Trail = tuple[_Point, tuple[_Point, ...]]
 
 
 def _moved(old: _Trail | None, value: float | None, here: int, oldest: int) -> _Trail | None:
-    """Return the history of an angle (with full turns), extended by the value of this frame."""
+    """Return the history of an angle after this frame. It counts full turns."""
     points = old[1] if old is not None else ()
     if points and points[0][0] < oldest:
         points = tuple(point for point in points if point[0] >= oldest)
@@ -373,7 +373,7 @@ def _moved(old: _Trail | None, value: float | None, here: int, oldest: int) -> _
 
 
 def column_of(values: list[Any]) -> Column:
-    """Return a list of values as a column (B, 1) with a mask of the known ones. ``None`` means unknown."""
+    """Return a list of values as a column (B, 1) with a mask of the known ones. None means unknown."""
     known = [value is not None for value in values]
     like = next((value for value in values if value is not None), 0.0)
     empty = "" if isinstance(like, str) else type(like)()
@@ -382,7 +382,7 @@ def column_of(values: list[Any]) -> Column:
 
 
 class StreamClock:
-    """Frame times of an online run. Temporal operators determine how many of them are kept.
+    """Frame times of an online run, and a shift that keeps them ascending after a backward jump.
 
     Parameters
     ----------
@@ -441,14 +441,14 @@ class StreamClock:
         self.tick = Tick(time_ns, last.number + 1, tolerance_ns(self.period))
 
     def breaks(self, *, bridge: bool) -> bool:
-        """True if this frame does not continue the previous one: after a gap or a backward jump of time.
+        """True if a recording gap, or a backward jump of time, is directly before this frame.
 
         With ``bridge``, gaps do not count.
         """
         return self.jump or (self.gap and not bridge)
 
     def told(self, time: int) -> int:
-        """Return the original time of a frame from its corrected, strictly ascending time; ns."""
+        """Return the recorded time of a frame, from the corrected time that ascends strictly; ns."""
         after = bisect_right(self._jumps, (time, NEVER, 0))
         return time - self._jumps[after - 1][1] if after else time
 

@@ -1,4 +1,4 @@
-"""Temporal values over whole traces, as arrays: durations, changes, sums and means."""
+"""Functions over time on whole traces, as arrays: durations, changes, sums and means."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ NS: Final = 1e9
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """Times of the frames of a trace, and their runs (frames without a gap between them).
+    """Times of the frames of a trace. A run is a series of frames without a gap.
 
     Attributes
     ----------
@@ -86,23 +86,23 @@ class SignalValues:
         self.clock = clock
 
     def signal(self, signal: Ask) -> Column:
-        """Return the values (B, F) of a single-frame query with a value, such as a speed."""
+        """Return a number such as a speed for each node combination and frame, (B, F)."""
         raise NotImplementedError
 
     def condition(self, expression: b.Bound, test: Test) -> Bools:
-        """Return a mask (B, F) of the frames in which the condition inside ``run_length(…)`` etc. is true."""
+        """Return a mask of the frames in which the condition inside ``run_length(…)`` or similar is true."""
         raise NotImplementedError
 
     def proposition(self, name: str) -> Bools:
-        """Return a mask (B, F) of the frames in which a named condition is true."""
+        """Return a mask of the frames in which a named condition is true, for each combination, (B, F)."""
         raise NotImplementedError
 
     def margins(self, course: b.SignalCall, test: Test) -> Floats:
-        """Return the robustness margins (B, F) of the condition inside ``robustness(…)``."""
+        """Return the margin of the condition in ``robustness(…)``, for each combination and frame, (B, F)."""
         raise NotImplementedError
 
     def test(self, test: Test) -> Column:
-        """Return the values (B, F) of an expression over several frames.
+        """Return the value of an expression for each node combination and frame, (B, F).
 
         An axis of equal values has length 1.
         """
@@ -111,7 +111,7 @@ class SignalValues:
         return Column(np.atleast_2d(found.values), found.known)
 
     def course(self, course: b.SignalCall, test: Test) -> Column:  # noqa: PLR0911 - a case each
-        """Return the values of a function over time, such as ``delta(x, 2s)``, at each frame."""
+        """Return the value of a function over time, such as ``delta(x, 2s)``, for each frame."""
         match course.word:
             case "prev":
                 return self._back(self.signal(test.signals[course.operand]), 1)
@@ -134,7 +134,7 @@ class SignalValues:
                 return self._age(seen) if word == "age" else Column(seen)
 
     def _back(self, column: Column, by: int | Ints) -> Column:
-        """Return, for each frame, the value of a column some frames earlier.
+        """Return, for each frame, the value of a column a given number of frames earlier.
 
         Values before the trace or across a gap are unknown.
         """
@@ -149,7 +149,7 @@ class SignalValues:
         return Column(values[:, inside], known[:, inside] & told)
 
     def window_starts(self, course: b.SignalCall) -> Ints:
-        """Return, for each frame, the first frame of the time window that ends there, (F,).
+        """For each frame, return the first frame of its time window.
 
         A window never crosses a gap.
         """
@@ -161,7 +161,7 @@ class SignalValues:
         return np.maximum(np.searchsorted(times, then, "left"), begun)
 
     def window_ends(self, course: b.SignalCall) -> Ints | None:
-        """Return, for each frame, the frame after its time window, (F,). ``None``: windows end at the frame."""
+        """For each frame, return the frame after its time window; None if all windows end at their frame."""
         if not course.ahead:
             return None
         times, frames = self.clock.times, len(self.clock.times)
@@ -187,7 +187,7 @@ class SignalValues:
         return Column(self._turned(now, by, change), known)
 
     def _turned(self, now: Column, by: int | Ints, change: Array) -> Array:
-        """Return the change of an angle over some frames, with full turns; degrees.
+        """Return, for each frame, the change of an angle since an earlier frame; degrees, with full turns.
 
         If values are missing, the shortest turn is assumed.
         """
@@ -201,7 +201,7 @@ class SignalValues:
         return np.where(whole, sums - sums[:, there], wrapped(change))
 
     def _run_length(self, flags: Bools, *, frames: bool) -> Column:
-        """Return the duration for which a condition has been true without a break, at each frame.
+        """For each frame, return the time for which a condition has been true without a break.
 
         It is in frames, or in s.
         """

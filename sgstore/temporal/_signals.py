@@ -74,7 +74,7 @@ def evaluate(formula: Formula, columns: Mapping[str, Bools], times: Ints) -> Boo
 
 
 def evaluate_rows(formula: Formula, columns: Mapping[str, Bools], times: Ints, rows: int) -> Bools:
-    """Return the truth value of a temporal formula at each frame, for several combinations of nodes, (B, F).
+    """Return the truth value of a temporal formula for each node combination and frame, (B, F).
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ def evaluate_rows(formula: Formula, columns: Mapping[str, Bools], times: Ints, r
 
 @dataclass(frozen=True, slots=True)
 class PropositionTable:
-    """Truth values of temporal formulas in one trace, from the truth values of their propositions.
+    """Truth values of temporal formulas in one trace, computed from single-frame conditions.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ class PropositionTable:
         return self.value(formula)[0]
 
     def value(self, formula: Formula) -> Bools:  # noqa: PLR0911 - a case each
-        """Return the truth value (B, F) of a formula at each frame.
+        """Return the truth value of a formula for each node combination and frame, (B, F).
 
         The shape is (1, F) if all node combinations have the same value.
         """
@@ -150,7 +150,7 @@ class PropositionTable:
                 return true if left == TRUE else true & (hit >= _last(~self.value(left)))
 
     def window(self, bound: Bound, *, forward: bool) -> tuple[Places | None, Places | None]:
-        """Return, for each frame, the nearest and the farthest frame in the time bound of an operator.
+        """For each frame, return the nearest and the farthest frame in the time bound of an operator.
 
         ``None`` as nearest frame means the frame itself; as farthest frame, the trace end.
         """
@@ -177,12 +177,12 @@ class PropositionTable:
 
     @property
     def frames(self) -> Places:
-        """Numbers of the frames of the trace, shape (F,)."""
+        """Number of each frame of the trace, shape (F,)."""
         return _frames(len(self.times))
 
     @property
     def _period(self) -> int | None:
-        """Constant time between frames; ns. ``None`` means that it varies."""
+        """Time between frames, if it is constant; otherwise None; ns."""
         if len(self.times) < 2:
             return None
         period = int(self.times[1] - self.times[0])
@@ -210,7 +210,7 @@ def _last(flags: Bools) -> Places:
 
 
 def _at(places: Places, frame: Places | None) -> Places:
-    """Return an array of frame numbers taken at the given frames.
+    """Return the values of an array of frame numbers at the given frames.
 
     The value is -1 before the trace, and F after it.
     """

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def topics_of(part: object) -> Iterator[TopicValue]:
-    """Yield the topic values that a part of a bound query or check uses."""
+    """Yield the topic values, such as a field of ``/imu``, that part of a query or check uses."""
     if isinstance(part, FrameAttribute):
         if (value := part.attribute.topic) is not None:
             yield value
@@ -38,7 +38,7 @@ def topics_of(part: object) -> Iterator[TopicValue]:
 
 
 class RecordedTopics:
-    """Topics of a recording, for the monitor that replays the recording.
+    """Topics of a recording that a monitor replays.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ class RecordedTopics:
         return self._decoded.facts
 
     def followed(self, blocks: Iterable[FrameBlock]) -> Iterator[FrameBlock]:
-        """Yield the blocks of frames unchanged, after the topic values of all their frames were read."""
+        """Read the topic values of all frames; then yield the blocks of frames unchanged."""
         if self.asked:
             asked = [*dict.fromkeys(self.asked)]
             times = [np.stack([block.time_ns, block.log_time_ns]) for block in self._again()]
@@ -85,13 +85,13 @@ class RecordedTopics:
         yield from blocks
 
     def on(self, frame: Frame) -> Frame:
-        """Add the topic values of the next frame to it, and return the frame."""
+        """Return the next frame, after its topic values were added."""
         frame.topics = next(self._waiting, {})
         return frame
 
 
 class TopicMemory:
-    """Last messages of the topics that a monitor needs.
+    """Last message of each topic that a monitor needs.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ class TopicMemory:
         self._last: dict[str, tuple[int, Any]] = {}
 
     def values(self, time_ns: int, messages: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the value of each field at a frame, by its text in a query. Unknown values are ``None``.
+        """Return the values of all fields at a frame: text in the query → value, or None if unknown.
 
         Parameters
         ----------
@@ -132,12 +132,12 @@ class TopicMemory:
 
 
 def message_of(messages: Mapping[str, Any], topic: str) -> Any:
-    """Return the message of a topic. The slash before its name may be missing in the query."""
+    """Return the message of a topic. The topic's name may lack its first slash."""
     return messages.get(topic, messages.get(f"/{topic}"))
 
 
 def _field(message: Any, path: str) -> Any:
-    """Return a field of a message, which is a mapping or an object. ``None`` means no such field."""
+    """Return a field of a message (mapping or object); None if the field is missing or unknown."""
     for part in path.replace("[", ".[").split("."):
         if part.startswith("["):
             index = int(part[1:-1])

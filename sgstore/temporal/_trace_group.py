@@ -1,4 +1,4 @@
-"""Query results of traces in memory: clocks and tables of matches, for one trace or for a group of traces.
+"""Query results of traces in memory: frame times and tables of matches, for one or several traces.
 
 A group has the frames of all its traces in one array, and each table begins with the index of the trace. So the
 work of a sequence does not grow with the number of traces.
@@ -49,7 +49,7 @@ class TimedRelation:
 
     @property
     def owners(self) -> Ints:
-        """Index of the match (combination of nodes) of each row, (R,)."""
+        """Index of the match (node combination) to which each row belongs, (R,)."""
         return np.repeat(np.arange(len(self.keys)), np.diff(self.starts))
 
     @classmethod
@@ -78,7 +78,7 @@ class TimedRelation:
         return cls(keys[first], np.append(first, len(frames)), frames, tuple(values))
 
     def between(self, first: int, last: int) -> TimedRelation:
-        """Return the table limited to a range of frames, ends included. Frame numbers restart at 0."""
+        """Return the table limited to a range of frames (ends included). Frames count from 0 again."""
         rows = np.flatnonzero((self.frames >= first) & (self.frames <= last))
         owners = np.searchsorted(self.starts, rows, "right") - 1
         new = np.flatnonzero(np.diff(owners, prepend=-1))
@@ -87,7 +87,7 @@ class TimedRelation:
         return TimedRelation(keys, starts, self.frames[rows] - first, values)
 
     def find(self, wanted: Keys) -> Ints:
-        """Return the table index of each combination of node ids (B, n), shape (B,). -1 means not found."""
+        """Return the index of each given node combination in the table, shape (B,). -1 if it is not there."""
         if not len(self.keys) or not len(wanted):
             return np.full(len(wanted), -1)
         if not wanted.shape[1]:
@@ -110,14 +110,14 @@ class TimedRelation:
         return owner, np.repeat(first, counts) + offset
 
     def flags(self, places: Ints, length: int) -> Bools:
-        """Return a mask (B, length) of the frames in which each match occurs. For index -1 it is false."""
+        """Return a mask (B, length): true if the match occurs in the frame. All false for index -1."""
         found = np.zeros((len(places), length), np.bool_)
         owner, rows = self.rows_of(places)
         found[owner, self.frames[rows]] = True
         return found
 
     def column(self, places: Ints, length: int, number: int = 0) -> Column:
-        """Return the value of each match in each frame, as a column (B, length) with a mask of known values."""
+        """Return the value of each match in each frame, (B, length), with a mask of the known values."""
         told = self.values[number]
         plain = np.ma.getdata(told)
         kind = np.float64 if plain.dtype.kind in "iuf" else plain.dtype
@@ -168,7 +168,7 @@ class TraceReader:
         return len(self.frame_ids)
 
     def between(self, first: int, last: int) -> TraceReader:
-        """Return a range of frames (ends included) as a separate trace."""
+        """Return a range of frames (ends included) as a trace of its own."""
         rows = slice(first, last + 1)
         return replace(
             self,
@@ -182,7 +182,7 @@ class TraceReader:
 
     @property
     def together(self) -> int:
-        """Number of node combinations that are processed at once, so that their arrays fit into memory."""
+        """Number of node combinations to process at once. Their arrays must fit into memory."""
         return max(CELLS // max(len(self), 1), 1)
 
     def seconds(self, frame: int) -> float:
@@ -192,7 +192,7 @@ class TraceReader:
 
 @dataclass(frozen=True, slots=True)
 class JointClock:
-    """Frame times of several traces on one time axis, with a day between each two traces.
+    """Frame times of several traces on one time axis. A day separates one trace from the next.
 
     Attributes
     ----------
@@ -248,7 +248,7 @@ class TraceGroup:
     def of(
         cls, about: Mapping[int, Sequence[Any]], clock: Mapping[str, Ints], gaps: str
     ) -> TraceGroup:
-        """Return the frames of some traces. ``about`` is: trace id → name, start (ns), frame period (ns)."""
+        """Return the frames of several traces. ``about``: trace id → name, start (ns), frame period (ns)."""
         columns = [clock[name] for name in ("frame_id", "seq", "time_ns", "log_time_ns")]
         known = np.isin(trace_of(columns[0]), [*about])
         if not known.all():
@@ -305,7 +305,7 @@ class TraceGroup:
 
     @property
     def clock(self) -> JointClock:
-        """Clock of all frames."""
+        """Clock with the frame times of all traces."""
         counts = np.diff(self.starts)
         first = self.starts[:-1]
         steps = np.diff(self.ticks, prepend=self.ticks[:1])
@@ -318,7 +318,7 @@ class TraceGroup:
 
     @property
     def _whole(self) -> bool:
-        """True if no trace lacks a frame, so that a frame number is also an index."""
+        """True if each trace has all frames, so that a frame number is also its index."""
         first = np.repeat(self.starts[:-1], np.diff(self.starts))
         return bool(np.array_equal(self.numbers + first, np.arange(len(first))))
 
@@ -327,11 +327,11 @@ class TraceGroup:
         return np.repeat(np.arange(len(self.ids)), np.diff(self.starts))[frames]
 
     def places(self, frame_ids: Ints) -> Ints:
-        """Return the index of each frame. -1 means that the group does not have it."""
+        """Return the index of each frame id in the group; -1 if it is not there."""
         return places_of(frame_ids, self.frame_ids, self.ids, self.starts)
 
     def table(self, buckets: Ints, keys: Keys, masks: Ints) -> TimedRelation:
-        """Return the table of matches from unsorted rows: bucket, node ids, and mask of frames."""
+        """Return a table of matches from rows in any order: bucket (64 frames), node ids, frame mask."""
         traces = buckets >> BUCKET_BITS
         owners = np.searchsorted(self.ids, traces)
         if len(self.ids):
@@ -361,7 +361,7 @@ class TraceGroup:
         return TimedRelation(keys[first], starts, frames)
 
     def reader(self, place: int) -> TraceReader:
-        """Return the data of one trace."""
+        """Return the data of one trace of the group."""
         rows = slice(int(self.starts[place]), int(self.starts[place + 1]))
         period = int(self.periods[place])
         clock = Clock(self.ticks[rows], self.runs[rows], period, tolerance_ns(period))
@@ -378,7 +378,7 @@ class TraceGroup:
         )
 
     def part(self, relation: TimedRelation, place: int) -> TimedRelation:
-        """Return the part of a table for one trace."""
+        """Return the rows of a table that belong to one trace."""
         low, high = np.searchsorted(relation.keys[:, 0], [place, place + 1]).tolist()
         starts = relation.starts[low : high + 1]
         rows = slice(int(starts[0]), int(starts[-1]))
@@ -391,7 +391,7 @@ class TraceGroup:
 
 
 def places_of(wanted: Ints, frame_ids: Ints, traces: Ints, starts: Ints) -> Ints:
-    """Return the index of each wanted frame id among ascending frame ids. -1 means not present.
+    """Return the index of each wanted frame id in a sorted array of frame ids; -1 if it is not there.
 
     Parameters
     ----------
@@ -416,7 +416,7 @@ def places_of(wanted: Ints, frame_ids: Ints, traces: Ints, starts: Ints) -> Ints
 
 
 def _bits(masks: Ints) -> NDArray[np.uint8]:
-    """Return the 64 bits of each mask, lowest bit first."""
+    """Return the bits of 64-bit masks as an array, lowest bit of each mask first."""
     return np.unpackbits(masks.astype("<i8").view(np.uint8), bitorder="little")
 
 
@@ -431,7 +431,7 @@ def _changes(keys: Keys) -> Bools:
 
 
 def codes_of(keys: Keys) -> Ints:
-    """Return a number for each row of a table, below the number of rows. Equal rows have equal numbers."""
+    """Number the rows of a table so that equal rows get the same number. Return one number per row."""
     order = ordering([*keys.T])
     found = np.empty(len(keys), np.int64)
     found[order] = np.cumsum(_changes(keys[order])) - 1
@@ -465,7 +465,7 @@ def ordering(columns: Sequence[Ints]) -> Ints:
 
 
 def ascending(times: Ints) -> Ints:
-    """Return frame times corrected to ascend strictly. Repeated times and backward jumps are moved forward.
+    """Return frame times that ascend strictly. Repeated times and backward jumps are moved forward.
 
     A repeated time becomes a nanosecond later. After a backward jump, all times are shifted by
     :data:`sgstore.model.world.JUMP_NS` after the last one. So the jump is a gap that no time bound spans.

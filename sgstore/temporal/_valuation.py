@@ -1,4 +1,4 @@
-"""Results of single-frame queries in an online monitor, and the node combinations (bindings) in a frame.
+"""Results of single-frame queries in an online monitor, and the bindings of a frame.
 
 A binding maps each variable to a node, or to ``None``: any node without known values. A binding without an
 entry uses the entry of its most specific stored generalisation. So a check over a hundred vehicles with five
@@ -32,7 +32,7 @@ T = TypeVar("T")
 
 
 class Lattice:
-    """Order of partial bindings (nodes for some of the variables), from none bound to all bound.
+    """Order of partial bindings, in which only some variables have nodes, from empty to complete.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class Lattice:
         self._patterns = [frozenset(pattern) for pattern in patterns]
 
     def placed(self, key: Key, places: tuple[int, ...]) -> Partial:
-        """Return the partial binding that has given nodes at some variables, and None at the others."""
+        """Return a partial binding with the given nodes at some variables, and None at the others."""
         if self.size == 1:
             return key or self.stranger
         told: list[int | None] = [None] * self.size
@@ -56,7 +56,7 @@ class Lattice:
         return tuple(told)
 
     def wider(self, binding: Partial) -> Iterator[Partial]:
-        """Yield a partial binding, then the bindings with fewer of its variables, most specific first."""
+        """Yield a partial binding, then the bindings with fewer of its nodes, most specific first."""
         if self.size == 1:
             yield binding
             if binding[0] is not None:
@@ -68,7 +68,7 @@ class Lattice:
                 yield tuple(n if place in pattern else None for place, n in enumerate(binding))
 
     def closed(self, bindings: Iterable[Partial], known: Iterable[Partial] = ()) -> set[Partial]:
-        """Return a set of partial bindings that also contains the union of any two of them.
+        """Return partial bindings, and the unions of any two of them without a conflict.
 
         The empty binding is included.
 
@@ -106,9 +106,7 @@ def _both(one: Partial, other: Partial) -> Partial | None:
 
 
 class BindingTable(Generic[T]):
-    """Table: binding (variables → nodes) → value. Without an entry, the entry of a less specific one counts.
-
-    A binding without an entry has the value of its next generalisation (fewer bound variables).
+    """Table: binding → value. A binding without an entry has the value of a less specific binding.
 
     Parameters
     ----------
@@ -122,7 +120,7 @@ class BindingTable(Generic[T]):
         self.held: dict[Partial, T] = {lattice.stranger: strangers}
 
     def of(self, binding: Partial) -> T:
-        """Return the value of a binding: its own entry, or that of the most specific generalisation."""
+        """Return the value of a binding, from its own entry or from the most specific entry that it extends."""
         held = self.held
         found = held.get(binding)
         if found is not None:
@@ -130,10 +128,7 @@ class BindingTable(Generic[T]):
         return next(held[wider] for wider in self.lattice.wider(binding) if wider in held)
 
     def keep(self, found: dict[Partial, T], same: Callable[[T, T], bool]) -> None:
-        """Replace the table. Values that also follow from a less specific binding are left out.
-
-        Bindings whose value equals that of a generalisation are dropped.
-        """
+        """Replace the table. Entries that equal the entry of a less specific binding are left out."""
         lattice = self.lattice
         strangers = found[lattice.stranger]
         if lattice.size < 2:
@@ -154,7 +149,7 @@ Key = tuple[int, ...]
 
 
 def answerer(ask: Ask) -> Callable[[FrameView, NodeNames], Mapping[Key, Any]]:
-    """Return a function that runs a query on one scene graph and returns the matches.
+    """Return a function that runs a query on a scene graph and returns its matches.
 
     Its result is: matched nodes → value (``None``: unknown).
 
@@ -193,7 +188,7 @@ def answerer(ask: Ask) -> Callable[[FrameView, NodeNames], Mapping[Key, Any]]:
 
 
 class NodeNames:
-    """Nodes of one scene graph in an online monitor, by kind, with their names.
+    """Nodes of one scene graph in an online monitor, grouped by kind, with their names.
 
     Parameters
     ----------
@@ -232,7 +227,7 @@ class NodeNames:
         return message_of(self._view.graph.topics, topic) is not None
 
     def has_lanes(self, what: str) -> bool:
-        """True if the map has values for lanes: ``ways``, ``curvature`` or ``slope``."""
+        """True if the map has values of ``ways``, ``curvature`` or ``slope`` for lanes."""
         reach = self._view.graph.reach
         return reach is not None and reach.tells(what)
 
@@ -243,7 +238,7 @@ class NodeNames:
 
 @dataclass(slots=True)
 class QueryCache:
-    """All single-frame queries of a monitor for one ego, with their results in the last frame.
+    """All single-frame queries of a monitor for one ego, with their results in the latest frame.
 
     Attributes
     ----------
@@ -263,7 +258,7 @@ class QueryCache:
     here: dict[b.Kinds, int] = field(default_factory=dict["b.Kinds", int])
 
     def met(self, kinds: b.Kinds) -> Mapping[int, str]:
-        """Return the nodes of the given kinds that have occurred so far: node → name.
+        """Return the nodes of the given kinds in all frames so far: node → name.
 
         Each frame extends the mapping.
         """

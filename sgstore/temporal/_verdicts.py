@@ -1,4 +1,4 @@
-"""Truth values of temporal formulas on whole traces, also for traces that end earlier.
+"""Truth values of temporal formulas on whole traces, and for each earlier end of the trace.
 
 At a frame, a forward formula has a *course*: its value if the trace ends there, and the later ends at which the
 value changes. Logic combines courses. An *until* with monotonic sides is true from one end on. At the requested
@@ -43,15 +43,12 @@ if TYPE_CHECKING:
 
 
 class TooDeep(Exception):  # noqa: N818 - no error: who asks goes another way
-    """Signal that a formula is nested too deeply for the fast evaluation. The caller uses a slower one.
-
-    The caller then uses the slow one.
-    """
+    """Exception: a formula is nested too deeply for the fast evaluation, so a slower one must be used."""
 
 
 @dataclass(frozen=True, slots=True)
 class PrefixVerdicts:
-    """Truth values of a formula at each frame, for every frame at which the trace could end.
+    """Truth values of a formula at each frame, for each possible end of the trace.
 
     Attributes
     ----------
@@ -65,12 +62,12 @@ class PrefixVerdicts:
     switches: Places
 
     def at(self, ends: Places) -> Bools:
-        """Return the truth value (F,) of the formula at each frame, if the trace ends at the given frame."""
+        """Return the formula's value at each frame, if the trace ends at the frame given for it."""
         return self.start ^ (np.sum(self.switches <= ends, axis=0) % 2 == 1)
 
     @property
     def rising(self) -> Places:
-        """Return, for each frame, the trace end from which on the formula is true, (F,). F means never.
+        """For each frame, return the first trace end at which the formula is true; the frame count if none.
 
         Raises
         ------
@@ -85,7 +82,7 @@ class PrefixVerdicts:
 
 
 def prefix_values(formula: Formula, table: PropositionTable) -> Bools:
-    """Return the value of a formula at the first frame, for every frame at which the trace could end, (F,).
+    """Return the truth value of a formula at the first frame, for each possible end of the trace.
 
     Raises
     ------
@@ -96,7 +93,7 @@ def prefix_values(formula: Formula, table: PropositionTable) -> Bools:
 
 
 def _at_first(formula: Formula, at: int, table: PropositionTable) -> Bools:  # noqa: PLR0911
-    """Return the truth value of a formula at one frame, for every frame at which the trace could end, (F,)."""
+    """Return the truth value of a formula at one frame, for each possible end of the trace."""
     frames = len(table.times)
     if not looks_ahead(formula):
         return np.full(frames, table.whole(formula)[at])
@@ -120,7 +117,7 @@ def _at_first(formula: Formula, at: int, table: PropositionTable) -> Bools:  # n
 
 
 def _shown(formula: Until, at: int, table: PropositionTable) -> Bools:
-    """Return True for each trace end at which an *until* that starts at one frame is already fulfilled."""
+    """Return, for each possible end of the trace, True if an *until* at one frame is fulfilled by then."""
     near, far = table.window(formula.bound, forward=True)
     frames = len(table.times)
     first = at if near is None else int(near[at])
@@ -143,7 +140,7 @@ def _shown(formula: Until, at: int, table: PropositionTable) -> Bools:
 
 
 def _course(formula: Formula, table: PropositionTable) -> PrefixVerdicts:
-    """Return the truth values of a formula at all frames, for every frame at which the trace could end.
+    """Return the truth values of a formula at all frames, for each possible end of the trace.
 
     Raises
     ------
@@ -233,7 +230,7 @@ class Settled:
 
     @cached_property
     def value(self) -> Bools:
-        """Mask (F,) of the frames in which the temporal formula is true."""
+        """Mask of the frames in which the temporal formula is true."""
         return self._table.whole(self.formula)
 
     @cached_property
@@ -241,17 +238,17 @@ class Settled:
         return known(self.formula, self._table)
 
     def trap(self, start: int) -> int | None:
-        """Return the frame after which the formula is certainly false at ``start``, or ``None``."""
+        """Return the frame at which the formula at ``start`` is decided as false; None if it never is."""
         trap = int(self._known[1][start])
         return trap if trap < self._frames else None
 
     @cached_property
     def _missed(self) -> Places:
-        """For each frame, the frame at which the formula becomes certainly false if the trace ends, (F,)."""
+        """For each frame, when the formula is decided as false, as the trace has ended."""
         return known(self.formula, self._table, ended=self._tolerance)[1]
 
     def due(self, start: int, end: str) -> bool:
-        """True if the formula at frame ``start`` counts as still open at the end of the trace, not as false.
+        """True if the formula at frame ``start`` counts as open, not as false, after the trace end.
 
         Parameters
         ----------
@@ -264,7 +261,7 @@ class Settled:
         return end == "bounded" and int(self._missed[start]) >= self._frames
 
     def statuses(self) -> NDArray[np.int8]:
-        """Return the status (F,) of the formula after each frame: indices in :data:`STATUS`."""
+        """Return the status of the formula after each frame, as an index in :data:`STATUS`."""
         try:
             ended = prefix_values(self.formula, self._table)
         except TooDeep:
@@ -275,7 +272,7 @@ class Settled:
         return told
 
     def _stepped(self) -> Bools:
-        """Return the truth value at the first frame for every possible trace end, computed frame by frame."""
+        """Return the truth value at the first frame, for each possible end of the trace, frame by frame."""
         progression = Progression(self.formula)
         names, plain = progression.names, progression.untimed and not progression.past
         end = min(int(self._known[0][0]), int(self._known[1][0]), self._frames - 1) + 1
@@ -301,7 +298,7 @@ class Settled:
         return ended
 
     def violations(self, reset: Bools | None, *, weak: bool = False) -> list[Violation]:
-        """Return the violations of the formula as frame ranges, evaluated from the first frame on.
+        """Return the violations of the formula as ranges of frames. Evaluation begins at the first frame.
 
         Parameters
         ----------
@@ -313,7 +310,7 @@ class Settled:
         return self.judged(reset, "weak" if weak else "strong")[0]
 
     def judged(self, reset: Bools | None, end: str) -> tuple[list[Violation], bool]:
-        """Return the violations of the formula as frame ranges, and True if it is still open at the trace end.
+        """Return the violations of the formula as ranges of frames, and True if it is open at the trace end.
 
         Parameters
         ----------
@@ -340,7 +337,7 @@ class Settled:
 
 
 def violations_of_always(held: Bools, reset: Bools | None) -> list[Violation]:
-    """Return the violations of ``ALWAYS p`` as frame ranges, if each frame decides p by itself.
+    """Return the violations of ``ALWAYS p`` as ranges of frames. Each frame must decide p by itself.
 
     Parameters
     ----------
@@ -364,7 +361,7 @@ def violations_of_always(held: Bools, reset: Bools | None) -> list[Violation]:
 def within_bounds(
     formula: Formula, columns: Mapping[str, Bools], times: Ints, gaps: Bools, rows: int
 ) -> tuple[Bools, Bools]:
-    """Return the lowest and highest possible value of a formula at the first frame.
+    """Return the lowest and the highest value that a formula can have at the first frame.
 
     Unseen events in recording gaps may change the value.
 
@@ -410,7 +407,7 @@ def _taken(formula: Formula, *, upper: bool) -> Formula:
 
 
 def always_true(formula: Formula) -> Formula | None:
-    """Return the formula p of ``ALWAYS p`` without time bound. ``None`` means another formula."""
+    """If a formula is ``ALWAYS p`` without time bound, return p; otherwise ``None``."""
     match formula:
         case Not(operand=Until(left=left, right=right, bound=bound)) if (
             left == TRUE and bound == WHOLE

@@ -1,4 +1,4 @@
-"""Aggregates over ranges of frames or time windows: minimum, maximum, sum and mean.
+"""Aggregates over ranges of frames and over time windows: minimum, maximum, sum and mean.
 
 Offline, each frame has an interval, given by its first frame and the frame after its last. All frames are
 processed at once, in O(n log w) for the longest interval w. Online, a stream keeps the values in its window.
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 def over_columns(word: str, column: Column, first: Places, end: Places | None = None) -> Column:
-    """Return, for each frame, an aggregate of the known values in its time window.
+    """For each frame, return an aggregate of the known values in its time window.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def over_columns(word: str, column: Column, first: Places, end: Places | None = 
 
 
 def greatest(values: Floats, first: Places, end: Places) -> Floats:
-    """Return, for each frame, the maximum of the values from frame ``first`` up to before ``end``, (B, F).
+    """For each frame, return the maximum of the values in a range, from ``first`` to just before ``end``.
 
     An empty range gives ``-inf``.
 
@@ -94,7 +94,7 @@ def greatest(values: Floats, first: Places, end: Places) -> Floats:
 
 
 def sums(values: Floats, first: Places, end: Places) -> Floats:
-    """Return, for each frame, the sum of the values from frame ``first`` up to before ``end``, (B, F).
+    """For each frame, return the sum of the values in a range, from ``first`` to just before ``end``.
 
     Sums are correctly rounded.
 
@@ -154,7 +154,7 @@ _UNIT: Final = 1074
 def next_window(
     word: str, window: Window | None, value: float | None, here: Tick, oldest: tuple[int, int]
 ) -> Window | None:
-    """Return a time window after one more frame: its value is added, and values outside are dropped.
+    """Move a time window to the next frame: add the frame's value, drop values that are too old.
 
     Parameters
     ----------
@@ -191,7 +191,7 @@ def next_window(
 
 
 def window_value(word: str, window: Window | None) -> float | None:
-    """Return the aggregate of the values in a time window. ``None`` means that no value is known."""
+    """Return the aggregate of the values in a time window; None without a known value."""
     if window is None:
         return None
     points, total = window
@@ -202,13 +202,13 @@ def window_value(word: str, window: Window | None) -> float | None:
 
 
 def exact(value: float) -> int:
-    """Return a float as an integer: its exact multiple of the smallest positive float."""
+    """Return a float as an integer: its exact multiple of the smallest positive float (5e-324)."""
     part, whole = float(value).as_integer_ratio()
     return part << (_UNIT - whole.bit_length() + 1)
 
 
 def rounded(total: int) -> float:
-    """Return a float from its exact multiple (an integer) of the smallest positive float."""
+    """Return the float for an integer: that multiple of the smallest positive float (5e-324)."""
     try:
         return total / (1 << _UNIT)
     except OverflowError:

@@ -1,4 +1,4 @@
-"""Truth lanes of a match: for each part of the pattern, the frames in which the part is true."""
+"""For a match: the frames in which each part of the pattern is true ("truth lanes")."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class TruthLane:
 
 @dataclass(frozen=True, slots=True)
 class TruthLanes:
-    """Truth lanes of a match over a whole trace: for each part of the pattern, the frames in which it is true.
+    """For a match: the frames of the trace in which each part of the pattern is true.
 
     Attributes
     ----------
@@ -65,11 +65,11 @@ class TruthLanes:
 
     @property
     def steps(self) -> tuple[int, ...]:
-        """Numbers of the sequence steps that have truth lanes; 0 for a pattern of single frames."""
+        """Numbers of the sequence steps that have truth lanes. A single-frame pattern is step 0."""
         return tuple(dict.fromkeys(lane.part.step for lane in self.lanes))
 
     def together(self, step: int = 0) -> tuple[tuple[int, int], ...]:
-        """Return the frame ranges (first, last) in which all parts of a step's pattern are true."""
+        """Return the frame ranges (first, last) in which a step's whole pattern is true."""
         spans = [lane.spans for lane in self.lanes if lane.part.step == step]
         found = spans[0] if spans else ()
         for others in spans[1:]:
@@ -77,7 +77,7 @@ class TruthLanes:
         return found
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the truth lanes as a dictionary with frame ranges.
+        """Return the result as a dictionary, with the frames of each part as ranges.
 
         Keys: ``trace``, ``binding``, ``lanes``, and ``together`` (ranges by step).
         """
@@ -95,7 +95,7 @@ class TruthLanes:
 def _intersection(
     one: tuple[tuple[int, int], ...], other: tuple[tuple[int, int], ...]
 ) -> Iterator[tuple[int, int]]:
-    """Yield the intersections of two sorted lists of frame ranges (first, last), in order."""
+    """Yield the ranges in which two sorted lists of frame ranges (first, last) overlap, in order."""
     a, z = 0, 0
     while a < len(one) and z < len(other):
         first, last = max(one[a][0], other[z][0]), min(one[a][1], other[z][1])
@@ -113,7 +113,7 @@ def truth_lanes(
     matches: Sequence[Match],
     rows: Callable[[Query, Sequence[str], Collection[str]], Sequence[NDArray[np.generic]]],
 ) -> list[TruthLanes]:
-    """Return the truth lanes of matches: for each part of the query's pattern, the frames in which it is true.
+    """Return, for each match, the frames in which each part of the query's pattern is true.
 
     Parameters
     ----------
