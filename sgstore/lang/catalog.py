@@ -1,4 +1,4 @@
-"""Catalog for the query compiler: the known attributes, and the contents of one store.
+"""Catalog for the query compiler: the known attributes, and the contents of a store.
 
 The attributes are fixed by the schema and are the same for every store. A :class:`Catalog` describes one
 store: the kinds of nodes in each table, the triples (relation, kind, kind) with their numbers of rows, and
@@ -49,7 +49,7 @@ Triple = tuple[str, str, str]
 
 
 class Home(StrEnum):
-    """Table of the store that holds the values of an attribute."""
+    """Table of the store in which the values of an attribute are."""
 
     state = "state"
     """Values of entities that move or change, frame by frame: table ``state``."""
@@ -62,7 +62,7 @@ class Home(StrEnum):
 
 
 class DisplayUnit(StrEnum):
-    """Conversion of a stored database value to the value that users see, such as its unit."""
+    """Conversion of a stored value to the value that users see, such as degrees or a word."""
 
     plain = "plain"
     degrees = "degrees"
@@ -145,7 +145,7 @@ _ON_ROADS: Final = frozenset({"lane", "junction", "road", "crosswalk", *SIGNALS}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Attribute:
-    """Attribute that queries can use, of a node, an edge, a frame or a trace.
+    """Attribute of a node, an edge, a frame or a trace that queries can use.
 
     Attributes
     ----------
@@ -204,12 +204,12 @@ class Attribute:
 
     @property
     def topic(self) -> TopicValue | None:
-        """Topic with the value. ``None`` means an attribute of another source."""
+        """Topic that contains the value; None if it is not the value of a topic."""
         return TopicValue.of(self.table) if self.table else None
 
     @property
     def of_store(self) -> bool:
-        """True if the value of the attribute comes from a table other than the scene graph of the frame."""
+        """True if the value of the attribute is in another table than the scene graph of the frame."""
         other = {DisplayUnit.seen, DisplayUnit.counted, DisplayUnit.weather, DisplayUnit.clock}
         return bool(self.table) or self.unit in other
 
@@ -231,7 +231,7 @@ def _constant(name: str, column: str, meaning: str, values: Sequence[str] = ()) 
 
 
 def _repeated(name: str, meaning: str, values: Sequence[str] = ()) -> Attribute:
-    """Return a text attribute of entities that is constant and stored in each of their states."""
+    """Return an attribute of entities: a text that is constant, but stored again in each state."""
     homes = {Home.state: name, Home.entity: name}
     return Attribute(name, Type.text, homes, meaning, own_kinds=_ENTITIES, values=values)
 
@@ -492,7 +492,7 @@ RECORDED_OWN: Final[Mapping[str, Type]] = {
 
 
 def own_type(types: Collection[Type]) -> Type:
-    """Return one type for a user-defined attribute that has several types in several traces.
+    """Return the type of a user-defined attribute whose type differs between traces.
 
     A number in one trace makes the attribute a number. Texts in other traces then count as missing values.
     """
@@ -681,7 +681,7 @@ PAIR_NAMES: Final[Mapping[str, str]] = {
 
 @dataclass(frozen=True, slots=True)
 class RelationScope:
-    """Settings that select the pairs of entities with relations, as in :class:`sgstore.model.config.Pairs`.
+    """Settings that select which pairs of entities have relations; see :class:`sgstore.model.config.Pairs`.
 
     Attributes
     ----------
@@ -716,7 +716,7 @@ class RelationScope:
 
     @classmethod
     def of(cls, settings: Mapping[str, Any]) -> Self | None:
-        """Return the relation scope (selection of entity pairs) from a trace's settings.
+        """Return the settings that select entity pairs from the settings of a trace.
 
         ``None`` means that the settings have no pairs.
         """
@@ -748,7 +748,7 @@ def _pairs_of(labels: Iterable[Iterable[str]]) -> tuple[tuple[str, ...], ...]:
 
 
 def excluded_kinds(labels: Iterable[str], counted: Iterable[str]) -> frozenset[str]:
-    """Return the kinds of node that the settings of a scene graph remove, completely or in part.
+    """Return the kinds of node that settings remove from scene graphs, all nodes of a kind or some.
 
     Parameters
     ----------
@@ -811,7 +811,7 @@ _PART: Final = re.compile(r"\[\d+\]|[^.\[]+|\[")
 
 @dataclass(frozen=True, slots=True)
 class TopicValue:
-    """Reference to a topic field in a query, with the rule that selects one message for each frame.
+    """Reference to a topic field in a query, and the rule that selects the message of each frame.
 
     Attributes
     ----------
@@ -844,20 +844,20 @@ class TopicValue:
 
     @property
     def relation(self) -> str:
-        """Name of the table in SQL that has the value for each frame."""
+        """Name of the SQL table that has the value of each frame."""
         parts = [self.topic, self.field, self.rule, self.tolerance_ns]
         return TOPIC + json.dumps(parts, ensure_ascii=False)
 
     @classmethod
     def of(cls, relation: str) -> Self | None:
-        """Return the topic value for the name of its SQL table. ``None`` means another table."""
+        """If an SQL table has a topic value, return this value; otherwise None."""
         told = relation.removeprefix(TOPIC)
         return None if told == relation else cls(*json.loads(told))
 
 
 @lru_cache(4096)
 def topic_attribute(value: TopicValue, kind: Type) -> Attribute:
-    """Return the attribute of frames for a value of a topic."""
+    """Return the frame attribute whose value is a value of a topic."""
     home = {Home.state: "value"}
     return Attribute(value.written, kind, home, "field of a topic", table=value.relation)
 
@@ -886,7 +886,7 @@ class TableFacts:
     joins: bool = True
 
     def attribute(self, column: str) -> Attribute | None:
-        """Return the query attribute for a column of a user table, ignoring case.
+        """Return the attribute for a column of a user table. Upper and lower case are equal.
 
         ``None`` means an unknown column.
         """
@@ -917,7 +917,7 @@ class TopicField:
 
     @property
     def type(self) -> Type:
-        """Type in query expressions. Lists and JSON are ``list``."""
+        """Type of the field in query expressions. A list or JSON field has the type ``list``."""
         if self.declared.endswith("]") or self.declared in {"JSON", "BLOB"}:
             return Type.list
         if _NUMBERS_OF_TOPICS.fullmatch(self.declared):
@@ -1043,7 +1043,7 @@ class Catalog:
     online: bool = False
 
     def under(self, abstraction: str) -> Catalog | None:
-        """Return the catalog of an abstraction, in any spelling. ``None`` means an unknown abstraction."""
+        """Return the catalog of an abstraction, in any spelling of its name; None if it does not exist."""
         wanted = normalize_name(abstraction)
         found = [made for name, made in self.sets.items() if normalize_name(name) == wanted]
         if not found and self.part:
@@ -1082,7 +1082,7 @@ def attributes_of(catalog: Catalog) -> dict[str, list[Attribute]]:
 def relations_of_set(
     answered: frozenset[str], known: frozenset[str], *, mapped: bool
 ) -> frozenset[str]:
-    """Return the relations of an imported graph set that the store can decide, according to its settings.
+    """Return the relations that an imported graph set decides: without an edge, they are false.
 
     Parameters
     ----------

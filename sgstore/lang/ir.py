@@ -1,4 +1,4 @@
-"""Intermediate representation of queries, between parser and SQL: patterns, sequences and checks.
+"""Queries after parsing and before SQL: patterns, sequences and checks with resolved names.
 
 All names are resolved and all values have types ("bound"). The stages after the binder share these classes.
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Kinds:
-    """Kinds of node (such as car or lane) that a query variable may match.
+    """Kinds of node, such as car or lane, that a query variable may match.
 
     There is one set for the ego and one for other nodes.
     """
@@ -46,22 +46,22 @@ class Kinds:
         return bool(self.ego or self.other)
 
     def only(self, kinds: frozenset[str]) -> Kinds:
-        """Return a copy of the allowed node kinds, limited to the given kinds."""
+        """Return a copy in which only the given kinds of node are allowed."""
         return Kinds(self.ego & kinds, self.other & kinds)
 
     @property
     def every(self) -> frozenset[str]:
-        """All allowed kinds of node, for the ego or for other nodes."""
+        """All allowed kinds of node, as the ego and as other nodes."""
         return self.ego | self.other
 
     @property
     def one_a_frame(self) -> bool:
-        """True if only the ego is allowed, so that a frame has at most one such node."""
+        """True if only the ego is allowed. A frame has at most one such node."""
         return not self.other
 
 
 def any_kinds() -> Kinds:
-    """Return all known kinds of node, for the ego and for others.
+    """Return all known kinds of node, for the ego and for other nodes.
 
     Readers, settings and stores may add kinds.
     """
@@ -69,7 +69,7 @@ def any_kinds() -> Kinds:
 
 
 def ego_kinds() -> Kinds:
-    """Return the kinds of a node that must be the ego: all entity kinds for the ego, none for others."""
+    """Return the allowed kinds of a variable that must be the ego: any entity kind, if it is the ego."""
     return Kinds(entity_kinds(), frozenset())
 
 
@@ -104,7 +104,7 @@ class Node:
 
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """Edge of a graph pattern in a query, or a path of ``low`` to ``high`` edges.
+    """Edge of a graph pattern in a query, or path of several such edges (from ``low`` to ``high``).
 
     Attributes
     ----------
@@ -169,7 +169,7 @@ class Value:
 
     @property
     def shown(self) -> float | str | bool | None:
-        """Constant as the user wrote it in the query, before rounding."""
+        """Constant before rounding, as the query text has it."""
         return self.value if self.written is None else self.written
 
 
@@ -183,7 +183,7 @@ class Choices:
 
 @dataclass(frozen=True, slots=True)
 class NodeValue:
-    """Expression that refers to a node of the pattern."""
+    """Expression whose value is a node of the pattern."""
 
     node: str
     type: Type = Type.node
@@ -204,7 +204,7 @@ class NodeAttribute:
 
 @dataclass(frozen=True, slots=True)
 class LabelTest:
-    """Condition that a node of an outer pattern has a label."""
+    """Condition: a node of an outer pattern has a label."""
 
     node: str
     kinds: Kinds
@@ -213,7 +213,7 @@ class LabelTest:
 
 @dataclass(frozen=True, slots=True)
 class EdgeRelation:
-    """Expression for the name of the relation that an edge variable matches."""
+    """Expression whose value is the name of the relation that an edge variable matches."""
 
     edge: str
     type: Type = Type.text
@@ -221,7 +221,7 @@ class EdgeRelation:
 
 @dataclass(frozen=True, slots=True)
 class EdgeAttribute:
-    """Expression for an attribute of an edge between an entity and a lane.
+    """Expression for an attribute of an edge from an entity to a lane.
 
     ``online`` means online mode: the primary lane may be unknown.
     """
@@ -268,7 +268,7 @@ class PairNumber:
 
 @dataclass(frozen=True, slots=True)
 class Happened:
-    """Condition that the recording has an event of some kind in this frame.
+    """Condition: the recording has an event of a given kind in this frame.
 
     Attributes
     ----------
@@ -312,13 +312,13 @@ class BlockValue:
 
     @property
     def inside(self) -> tuple[Bound, ...]:
-        """Conditions inside the braces, and the value after ``|``."""
+        """All expressions inside the braces: the conditions, and the value after ``|``."""
         return self.scope.where if self.value is None else (*self.scope.where, self.value)
 
 
 @dataclass(frozen=True, slots=True)
 class Aggregate:
-    """Aggregate over the matches of a query, such as ``COUNT(*)`` or ``AVG(x)``. ``COUNT(*)`` has no operand.
+    """Aggregate over the matches of a query, such as ``AVG(x)``, or ``COUNT(*)`` without an operand.
 
     ``share`` is the fraction of a percentile: 0.95 is the 95th percentile.
     """
@@ -332,7 +332,7 @@ class Aggregate:
 
 @dataclass(frozen=True, slots=True)
 class GroupKey:
-    """Grouping value of a query with aggregates: matches with equal values form a group.
+    """Grouping value of a query with aggregates: matches with equal values are one group.
 
     ``name`` is the name of its result column.
     """
@@ -343,7 +343,7 @@ class GroupKey:
 
 @dataclass(frozen=True, slots=True)
 class Tense:
-    """Temporal operator, such as ``EVENTUALLY``: its operands are evaluated at other frames.
+    """Temporal operator, such as ``EVENTUALLY``. Its operands are conditions at other frames.
 
     Attributes
     ----------
@@ -368,7 +368,7 @@ class Tense:
 
 @dataclass(frozen=True, slots=True)
 class SignalCall:
-    """Call of a function of a value over time, such as ``prev(x)`` or ``delta(x, 2s)``.
+    """Function of a value over time, such as ``prev(x)`` or ``delta(x, 2s)``, with its arguments.
 
     Attributes
     ----------
@@ -406,7 +406,7 @@ ANGLES: Final = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class StepTime:
-    """Time of a sequence step, in seconds since the start of the trace. ``step`` is its number."""
+    """Time at which a sequence step matches, in seconds since the start of the trace."""
 
     step: int
     type: Type = Type.number
@@ -421,7 +421,7 @@ PLACES: Final = frozenset({"argmin", "argmax"})
 
 @dataclass(frozen=True, slots=True)
 class OverMatch:
-    """Aggregate over the frames of a match, or of some steps, such as ``MIN(ttc(e, v)) OVER match``.
+    """Aggregate over the frames of a match or of some steps, such as ``MIN(ttc(e, v)) OVER match``.
 
     Attributes
     ----------
@@ -497,7 +497,7 @@ class Scope:
     distinct: frozenset[tuple[str, str]]
 
     def kinds(self, key: str) -> Kinds:
-        """Return the allowed kinds of a node of this pattern, or of an outer node that the pattern uses."""
+        """Return the kinds that a node may have, in this pattern or in the pattern around it."""
         return self.nodes[key].kinds if key in self.nodes else self.outer[key]
 
 
@@ -525,7 +525,7 @@ Form = Literal["rows", "intervals", "clips", "subgraphs"]
 
 @dataclass(frozen=True, slots=True)
 class ReturnColumn:
-    """Value that a query returns, with the name of its result column.
+    """Column of a query result: an expression, and the name of the column.
 
     Attributes
     ----------
@@ -550,7 +550,7 @@ class SortKey:
 
 @dataclass(frozen=True, slots=True)
 class Sampling:
-    """Limit of a query result: at most ``number`` results for each value of ``per``.
+    """Limit per group: a query result has at most ``number`` rows for each value of ``per``.
 
     If ``per`` is ``None``, the limit is for all results.
     """
@@ -561,7 +561,7 @@ class Sampling:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """Result clause of a query: its columns, and its form (rows, intervals, subgraphs or clips).
+    """Result clause of a query: its columns, and its form, such as rows or intervals.
 
     Attributes
     ----------
@@ -607,7 +607,7 @@ class Result:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the result columns that identify a frame, an interval or a clip."""
+        """Names of the first result columns: those that identify a frame, an interval or a clip."""
         if self.form == "subgraphs":
             return FRAME_COLUMNS
         if self.form != "rows":
@@ -616,7 +616,7 @@ class Result:
 
     @property
     def values(self) -> list[Bound]:
-        """All expressions in the result clause: columns, ``HAVING``, sort keys and sampling keys."""
+        """All expressions of the result clause, from columns, ``HAVING``, sorting and sampling."""
         per = [chosen.per for chosen in (self.sample, self.top) if chosen is not None]
         values = [*(column.value for column in self.columns), *(key.value for key in self.order)]
         every = (*values, self.having, *per)
@@ -631,18 +631,18 @@ class Result:
 
     @property
     def groups(self) -> bool:
-        """True if a row combines several frames: an aggregate, or ``DISTINCT`` values without the frame."""
+        """True if one row may come from several frames: by aggregates, or by ``DISTINCT`` values."""
         return self.aggregated or (self.distinct and not (self.whole or self.framed))
 
     @property
     def chooses(self) -> bool:
-        """True if the result leaves out matches: by ``SKIP``, ``LIMIT``, or a ``HAVING`` without groups."""
+        """True if ``SKIP``, ``LIMIT`` or ``HAVING`` may remove matches from the result."""
         chosen = self.limit is not None or self.top is not None or self.skip > 0
         return chosen or (self.having is not None and not self.aggregated)
 
     @property
     def among_rows(self) -> list[str]:
-        """Clauses of the result that need all rows, because they sort, select or aggregate them."""
+        """Names of the clauses that need all rows at once, because they sort, select or aggregate them."""
         clauses = {
             "aggregates such as COUNT(*)": self.aggregated,
             "DISTINCT": self.distinct,
@@ -655,7 +655,7 @@ class Result:
         return [word for word, used in clauses.items() if used]
 
     def having_of_match(self, reason: str) -> Bound | None:
-        """Return the ``HAVING`` condition on the values of one match, without references to columns.
+        """Return the ``HAVING`` condition for a single match. Names of result columns are replaced.
 
         Parameters
         ----------
@@ -724,7 +724,7 @@ class PathValue:
 
 @dataclass(frozen=True, slots=True)
 class PathWay:
-    """Graph pattern in which each named path has a fixed length. ``nodes`` are the node keys of each path."""
+    """Graph pattern in which each path has a fixed length. ``nodes``: the node keys of each path."""
 
     scope: Scope
     nodes: tuple[tuple[str, ...], ...]
@@ -732,7 +732,7 @@ class PathWay:
 
 @dataclass(frozen=True, slots=True)
 class MatchStage:
-    """``MATCH`` or ``OPTIONAL MATCH`` clause in a query with several clauses.
+    """Clause ``MATCH`` or ``OPTIONAL MATCH`` of a query with several clauses.
 
     Attributes
     ----------
@@ -757,7 +757,7 @@ class MatchStage:
 
 @dataclass(frozen=True, slots=True)
 class WithStage:
-    """``WITH`` clause: selects the variables and values that later clauses can use, frame by frame.
+    """Clause ``WITH``: in each frame, it selects the variables and values that later clauses can use.
 
     Attributes
     ----------
@@ -795,7 +795,7 @@ class WithStage:
 
     @property
     def expressions(self) -> tuple[Bound, ...]:
-        """All expressions in the ``WITH`` clause."""
+        """All expressions of the ``WITH`` clause."""
         order = (key.value for key in self.order if not isinstance(key.value, str))
         return (*(column.value for column in self.values), *order, *self.where)
 
@@ -819,18 +819,18 @@ PASSED: Final = ":with "
 def passed_on(
     name: str, kind: Type, precision: str = "", *, stored: bool = False
 ) -> FrameAttribute:
-    """Return a new placeholder expression for a value that ``WITH`` passes on."""
+    """Return a placeholder expression for a value that ``WITH`` passes on."""
     attribute = Attribute(name, kind, {}, "", DisplayUnit.whole, precision=precision, stored=stored)
     return FrameAttribute(attribute, kind)
 
 
 def is_passed_on(value: Bound) -> TypeGuard[FrameAttribute]:
-    """True if the expression is a placeholder for a value that ``WITH`` passes on."""
+    """True if an expression is a placeholder for a value that ``WITH`` passes on."""
     return isinstance(value, FrameAttribute) and value.attribute.name.startswith(PASSED)
 
 
 def items_of(value: Bound) -> Type | None:
-    """Return the type of the items of a collected list. ``None`` means another value."""
+    """If an expression is a collected list, return the type of its items; otherwise None."""
     if isinstance(value, Aggregate) and value.type is Type.list and value.operand is not None:
         return value.operand.type
     if not is_passed_on(value) or value.type is not Type.list or is_path(value):
@@ -839,7 +839,7 @@ def items_of(value: Bound) -> Type | None:
 
 
 def is_path(value: Bound) -> bool:
-    """True if the expression is a placeholder for a named path."""
+    """True if an expression is a placeholder for a named path."""
     return is_passed_on(value) and value.attribute.name.rpartition(" ")[2][0] == "p"
 
 
@@ -899,7 +899,7 @@ class Query:
 
     @property
     def ways(self) -> tuple[StepWay, ...]:
-        """Alternative sequences of the query's steps; usually one. Groups such as ``(A | B)`` give several."""
+        """Plain step sequences of the query: several for groups such as ``(A | B)``, otherwise one."""
         if self.alternatives:
             return self.alternatives
         happen = tuple(n for n, step in enumerate(self.steps) if not step.absent)
@@ -907,24 +907,24 @@ class Query:
 
     @property
     def spans(self) -> bool:
-        """True if a match of the query can last for several frames."""
+        """True if a match of the query can be longer than one frame."""
         return len(self.steps) > 1 or bool(self.alternatives)
 
     @property
     def certain(self) -> frozenset[int]:
-        """Numbers of the sequence steps that occur in every match."""
+        """Numbers of the sequence steps that every match contains."""
         return frozenset.intersection(*(frozenset(way.happen) for way in self.ways))
 
     @property
     def patterns(self) -> tuple[Scope, ...]:
-        """All graph patterns of the query, from sequence steps or from ``MATCH`` clauses."""
+        """All graph patterns of the query: those of its steps, or of its ``MATCH`` clauses."""
         stages = (stage.scope for stage in self.stages if isinstance(stage, MatchStage))
         found = (*(step.scope for step in self.steps), *stages)
         return found or (self.scope,)
 
     @property
     def required(self) -> tuple[Scope, ...]:
-        """Patterns for single frames that every match needs: all except those of ``OPTIONAL MATCH``."""
+        """Graph patterns that every match must meet: all except those of ``OPTIONAL MATCH``."""
         stages = (s for s in self.stages if isinstance(s, MatchStage) and not s.optional)
         return tuple(stage.scope for stage in stages) or (self.scope,)
 
@@ -935,7 +935,7 @@ class Query:
 
 
 def passed_values(query: Query) -> tuple[FrameAttribute, ...]:
-    """Return placeholders for the ``WITH`` values and paths that a match has after the last clause."""
+    """Return placeholders for the ``WITH`` values and paths that exist after the last clause."""
     found: tuple[FrameAttribute, ...] = ()
     for stage in query.stages:
         if isinstance(stage, WithStage):
@@ -946,7 +946,7 @@ def passed_values(query: Query) -> tuple[FrameAttribute, ...]:
 
 
 def any_of(conditions: Iterable[Bound]) -> Bound:
-    """Return a condition that is true if at least one of the given conditions is true.
+    """Join conditions by ``OR``.
 
     Without conditions it is false.
     """
@@ -957,7 +957,7 @@ def any_of(conditions: Iterable[Bound]) -> Bound:
 
 
 def all_of(*conditions: Bound) -> Bound:
-    """Return a condition that is true if all given conditions are true. At least one condition is required."""
+    """Join conditions by ``AND``. At least one condition is required."""
     return conditions[0] if len(conditions) == 1 else Operation("AND", conditions, Type.boolean)
 
 
@@ -967,18 +967,18 @@ def inverse(condition: Bound) -> Operation:
 
 
 def is_one_of(value: Bound, numbers: Iterable[int]) -> Operation:
-    """Return the condition that a value is in a list of numbers."""
+    """Return a condition: true if a value is in a list of numbers."""
     choices = Choices(tuple(Value(number, Type.number) for number in numbers))
     return Operation("IN", (value, choices), Type.boolean)
 
 
 def node_among(node: str, ids: Iterable[int]) -> Operation:
-    """Return the condition that the id of a node is in a list of ids."""
+    """Return a condition: true if the id of a node is in a list of ids."""
     return is_one_of(NodeAttribute(node, NODE_ATTRIBUTES["id"], Type.number), ids)
 
 
 def operands_of(expression: Bound) -> tuple[Bound, ...]:
-    """Return the direct operands of an expression. The content of patterns in braces is not included."""
+    """Return the direct operands of an expression. Expressions inside braces do not count."""
     match expression:
         case Operation(operands=operands) | Tense(operands=operands):
             return operands
@@ -1004,14 +1004,14 @@ def with_operands(expression: Bound, change: Callable[[Bound], Bound]) -> Bound:
 
 
 def walk(expression: Bound) -> Iterator[Bound]:
-    """Yield an expression and all its subexpressions. The content of patterns in braces is not included."""
+    """Yield an expression and all its subexpressions. Expressions inside braces do not count."""
     yield expression
     for operand in operands_of(expression):
         yield from walk(operand)
 
 
 def conjuncts(expression: Bound) -> list[Bound]:
-    """Return the list of conditions that ``AND`` joins in an expression."""
+    """Split an expression at ``AND``, and return the conditions as a list."""
     if isinstance(expression, Operation) and expression.word == "AND":
         return [part for operand in expression.operands for part in conjuncts(operand)]
     return [expression]
@@ -1042,7 +1042,7 @@ def is_formula(expression: Bound) -> bool:
 
 
 def is_angle(value: Bound) -> bool:
-    """True if a value is an angle, which wraps around at 360 degrees."""
+    """True if the value of an expression is an angle, which restarts after 360 degrees."""
     match value:
         case NodeAttribute(attribute=attribute) | EdgeAttribute(attribute=attribute):
             return attribute.name in ANGLES
@@ -1058,7 +1058,7 @@ def is_counted(expression: Bound) -> bool:
 
 
 def nodes_of(expression: Bound) -> frozenset[str]:
-    """Return the keys of the nodes that an expression uses. For a pattern in braces, only outer nodes count."""
+    """Return the keys of the nodes in an expression. In braces, only nodes of the outer pattern count."""
     found: set[str] = set()
     for part in walk(expression):
         match part:
@@ -1076,19 +1076,19 @@ def nodes_of(expression: Bound) -> frozenset[str]:
 
 
 def edges_of(expression: Bound) -> frozenset[str]:
-    """Return the keys of the edges that an expression uses, without the edges inside braces."""
+    """Return the keys of the edges in an expression. Edges inside braces do not count."""
     edges = (EdgeRelation, EdgeAttribute)
     return frozenset(part.edge for part in walk(expression) if isinstance(part, edges))
 
 
 def blocks_of(expression: Bound) -> tuple[BlockValue, ...]:
-    """Return the patterns in braces, such as ``EXISTS {…}``, in an expression. Nested ones are not included."""
+    """Return the patterns in braces, such as ``EXISTS {…}``, in an expression; not those inside them."""
     return tuple(part for part in walk(expression) if isinstance(part, BlockValue))
 
 
 @dataclass(frozen=True, slots=True)
 class Length:
-    """Duration in a query: ``amount`` nanoseconds or frames."""
+    """Duration in a query: a number of nanoseconds or of frames."""
 
     amount: int
     frames: bool
@@ -1106,7 +1106,7 @@ _COMPARE: Final[Mapping[str, Callable[[Any, int, int], Any]]] = {
 
 @dataclass(frozen=True, slots=True)
 class BoundHold:
-    """Condition on the duration of a sequence step, from the first to the last frame in which it matches.
+    """Required duration of a sequence step, from the first to the last frame in which it matches.
 
     Attributes
     ----------
@@ -1122,7 +1122,7 @@ class BoundHold:
     inclusive: bool
 
     def fits(self, length: Any, tolerance: int) -> Any:
-        """Return True if a duration meets the condition. Arrays of durations give arrays.
+        """Return True if a duration meets the condition. For an array, return an array.
 
         Parameters
         ----------
@@ -1141,7 +1141,7 @@ class BoundHold:
 
 @dataclass(frozen=True, slots=True)
 class StepLink:
-    """Time relation between a sequence step and the previous step, such as ``THEN WITHIN 5s``.
+    """Time relation between a sequence step and the step before it, such as ``THEN WITHIN 5s``.
 
     Attributes
     ----------
@@ -1158,7 +1158,7 @@ class StepLink:
 
 @dataclass(frozen=True, slots=True)
 class StepWay:
-    """Alternative order of the steps of a query, such as ``A THEN B`` of ``A THEN (B | C)``.
+    """Plain sequence of steps, one of several of a query: ``A THEN B``, from ``A THEN (B | C)``.
 
     Attributes
     ----------
@@ -1176,7 +1176,7 @@ class StepWay:
 
 @dataclass(frozen=True, slots=True)
 class BoundStep:
-    """Step of a sequence: a graph pattern, with its conditions and duration.
+    """Step of a sequence: a graph pattern, with additional conditions and a duration.
 
     Attributes
     ----------
@@ -1220,7 +1220,7 @@ class BoundQuantifier:
 
 @dataclass(frozen=True, slots=True)
 class BoundCheck:
-    """``CHECK`` statement with resolved names: a condition that must be true from the first frame of a trace.
+    """``CHECK`` statement with resolved names: a condition that a trace must meet from its first frame.
 
     Attributes
     ----------

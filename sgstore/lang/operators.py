@@ -1,4 +1,4 @@
-"""Operators and functions of query expressions, each defined once: as SQL, for one value, and for arrays.
+"""Operators and functions of query expressions, each defined as SQL, for one value, and for arrays.
 
 An operand may be unknown. Most operators are *strict*: if an operand is unknown, the value is unknown. So
 they are written for known values only. Logic, tests of ``NULL``, ``coalesce`` and ``IN`` have their own
@@ -31,7 +31,7 @@ MIRRORED: Final = {"<": ">", "<=": ">=", ">": "<", ">=": "<=", "=": "=", "<>": "
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """Array of the values of an expression, with a mask of the known values.
+    """Array with the values of an expression, and a mask of the known values.
 
     Attributes
     ----------
@@ -47,23 +47,23 @@ class Column:
 
     @property
     def flags(self) -> Bools:
-        """Values of the column as an array of booleans."""
+        """The values, as an array of booleans."""
         return np.asarray(self.values, np.bool_)
 
     @property
     def true(self) -> Any:
-        """Mask of the values that are known and true."""
+        """Mask: true where a value is known and true."""
         return self.flags if self.known is True else self.known & self.flags
 
     @property
     def false(self) -> Any:
-        """Mask of the values that are known and false."""
+        """Mask: true where a value is known and false."""
         flags = np.logical_not(self.flags)
         return flags if self.known is True else self.known & flags
 
 
 def all_known(columns: Iterable[Column]) -> Any:
-    """Return the mask of the positions at which every column has a known value. ``True`` means all."""
+    """Return a mask: true where all columns have a known value. ``True`` alone means everywhere."""
     found: Any = True
     for column in columns:
         if column.known is not True:
@@ -73,7 +73,7 @@ def all_known(columns: Iterable[Column]) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Operator:
-    """Operator or function of query expressions: as SQL, for one value, and for arrays.
+    """Operator or function of query expressions, defined as SQL, for one value, and for arrays.
 
     Attributes
     ----------
@@ -103,12 +103,12 @@ _BRACKETS: Final = re.compile(r"""(?:"[^"]*"|'[^']*'|[^"'()])*([()])""")
 
 
 def operand_text(text: str) -> str:
-    """Return SQL that is safe as an operand: in brackets, unless it is one word or one call."""
+    """Return an SQL text that can be an operand: in brackets, unless it is one word or one call."""
     return text if _WHOLE.fullmatch(text) or _is_call(text) else f"({text})"
 
 
 def _is_call(text: str) -> bool:
-    """True if an SQL text is one call or one expression in brackets."""
+    """True if an SQL text is a single call, or is completely in brackets."""
     if not re.match(r"\w*\(", text):
         return False
     depth = 0
@@ -120,7 +120,7 @@ def _is_call(text: str) -> bool:
 
 
 def _sql(form: str | SqlOf) -> SqlOf:
-    """Return a function that builds the SQL of an operator from a template and its operands.
+    """Return a function that puts the SQL of operands into a template of an operator's SQL.
 
     ``abs(...)`` is a call, ``(... AND ...)`` joins all operands, ``{0} = {1}`` has a place for each operand.
     """
@@ -136,7 +136,7 @@ def _sql(form: str | SqlOf) -> SqlOf:
 
 
 def _odd(parts: Sequence[str]) -> str:
-    """Return the SQL of ``XOR``, true if an odd number of operands is true.
+    """Return the SQL of ``XOR``, which is true if an odd number of operands is true.
 
     Like ``<>``, it is NULL if an operand is NULL.
     """
@@ -144,7 +144,7 @@ def _odd(parts: Sequence[str]) -> str:
 
 
 def _where(part: str, condition: str) -> str:
-    """Return SQL for a value if a condition on it (``v``) is true, otherwise NULL.
+    """Return SQL for a value that becomes NULL if a condition on it (``v``) is false.
 
     The value is written only once. Otherwise, the text of nested operators would grow exponentially.
     """
@@ -152,7 +152,7 @@ def _where(part: str, condition: str) -> str:
 
 
 def _not_zero(part: str) -> str:
-    """Return the SQL of a divisor, with NULL in place of zero.
+    """Return SQL for a divisor that becomes NULL if it is zero.
 
     ``nullif`` is faster, but it is a macro that plans its argument twice. So only the innermost of several
     nested divisors uses it.
@@ -201,7 +201,7 @@ def _strict(
     infix: bool = False,
     partial: bool = False,
 ) -> Operator:
-    """Return an operator whose result is unknown if one of its operands is unknown.
+    """Return an operator. Its result is unknown if an operand is unknown.
 
     Without ``partial``, the operator has a value for all known operands. With ``partial``, ``one`` returns
     ``None`` for a missing value, and ``columns`` returns the values and a mask of valid values.
@@ -242,7 +242,7 @@ def _divided(a: float, by: float) -> float | None:
 
 
 def _over_columns(function: Callable[..., Any]) -> Callable[..., tuple[Any, Any]]:
-    """Return the array version of a division. The result is unknown where the divisor is 0."""
+    """Return the division of arrays. A result is unknown where the divisor is 0."""
 
     def of_columns(a: Any, by: Any) -> tuple[Any, Any]:
         fits = np.not_equal(by, 0)
@@ -269,7 +269,7 @@ def _sign(a: float) -> int:
 
 
 def _finite(function: Callable[..., float]) -> Callable[..., float | None]:
-    """Return a version of a :mod:`math` function that returns ``None`` for errors and non-finite numbers."""
+    """Return a :mod:`math` function that returns None instead of an error, infinity or NaN."""
 
     def one(*values: float) -> float | None:
         try:
@@ -282,7 +282,7 @@ def _finite(function: Callable[..., float]) -> Callable[..., float | None]:
 
 
 def _each(one: Callable[..., float | None]) -> Callable[..., Any]:
-    """Return an array version of a number function, which computes each value separately.
+    """Return a function for arrays that calls a function for numbers once for each value.
 
     Functions of numpy differ in the last bit from the C library, which Python and the database use.
     """
@@ -298,13 +298,13 @@ def _each(one: Callable[..., float | None]) -> Callable[..., Any]:
 
 
 def _computed(sql: str, function: Callable[..., float]) -> Operator:
-    """Return an operator for a function of :mod:`math`. A non-finite result counts as unknown."""
+    """Return an operator for a function of :mod:`math`. Its result is unknown if it is not finite."""
     one = _finite(function)
     return _strict(sql, one, _each(one), partial=True)
 
 
 def _rounded(a: float) -> float:
-    """Return the nearest integer of a number. Halves are rounded away from zero, as in SQL."""
+    """Return a number rounded to an integer; halves away from zero, as in SQL."""
     return math.copysign(math.floor(abs(a) + 0.5), a)
 
 
@@ -318,7 +318,7 @@ def _float32_columns(numbers: Any) -> tuple[Any, Any]:
 
 
 def microseconds(seconds: float) -> float:
-    """Return a time in seconds, rounded to whole microseconds. Halves are rounded away from zero."""
+    """Return a time in seconds, rounded to microseconds; halves away from zero."""
     return _rounded(seconds * 1e6) / 1e6
 
 
@@ -356,7 +356,7 @@ def _ruled(
     *,
     infix: bool = False,
 ) -> Operator:
-    """Return an operator with its own rule for unknown operands, such as ``AND``.
+    """Return an operator, such as ``AND``, with its own rule for unknown operands.
 
     ``one`` reads the operands lazily.
     """

@@ -23,7 +23,7 @@ _INDEX: Final = re.compile(r"(?P<list>.+)\[(?P<index>\d{1,6})\]")
 
 
 class TopicError(SgstoreError):
-    """Error: a topic, field or rule does not exist, or a topic cannot be decoded.
+    """Error: a topic or its field does not exist, a topic cannot be decoded, or a rule is unknown.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class NoTopicError(TopicError):
 
 
 def fields_of(facts: TopicFacts) -> Mapping[str, TopicField]:
-    """Return the fields of a topic, by name.
+    """Return the fields of a topic: name → field.
 
     Raises
     ------
@@ -71,7 +71,7 @@ _READ: Final = {("protobuf", "protobuf"), ("cdr", "ros2msg")}
 
 
 def refusal(message_encoding: str, schema_encoding: str) -> str:
-    """Return the reason why messages with an encoding cannot be decoded, or an empty text if they can."""
+    """If messages of an encoding cannot be decoded, return the reason; otherwise an empty text."""
     if message_encoding == "json" or (message_encoding, schema_encoding) in _READ:
         return ""
     by = f" with a schema in {schema_encoding!r}" if schema_encoding else " without a schema"
@@ -79,7 +79,7 @@ def refusal(message_encoding: str, schema_encoding: str) -> str:
 
 
 def topic_of(topics: Mapping[str, TopicFacts], name: str) -> TopicFacts:
-    """Return the facts of the topic with a name. An unknown name raises an error.
+    """Return the topic with this name. An unknown name raises an error.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def topic_of(topics: Mapping[str, TopicFacts], name: str) -> TopicFacts:
 
 
 def unknown_topic(name: str, known: Iterable[str]) -> NoTopicError:
-    """Return the error for a topic that does not exist, with the most similar topic or all topics."""
+    """Return the error for an unknown topic. It names the most similar topic, or all topics."""
     names = sorted(known)
     like = suggestion(name, names)
     listed = f"the topics are {excerpts([*map(repr, names)])}" if names else "no topic has a name"
@@ -101,12 +101,12 @@ def unknown_topic(name: str, known: Iterable[str]) -> NoTopicError:
 
 
 def field_list(names: Iterable[tuple[str, str]]) -> dict[str, TopicField]:
-    """Return the fields of a topic by name, from pairs of name and database type."""
+    """Return the fields of a topic, name → field, from pairs of name and database type."""
     return {name: TopicField(name, declared) for name, declared in names}
 
 
 def field_of(facts: TopicFacts, path: str) -> TopicField:
-    """Return a field of a topic, or an element of a list field: ``covariance[0]``.
+    """Return a field of a topic, or an element of a list field, such as ``covariance[0]``.
 
     Raises
     ------
@@ -117,7 +117,7 @@ def field_of(facts: TopicFacts, path: str) -> TopicField:
 
 
 def field_named(fields: Mapping[str, TopicField], topic: str, path: str) -> TopicField:
-    """Return a field of a topic from the given fields. See :func:`field_of`."""
+    """Return the field of a topic with this name; see :func:`field_of`."""
     found = find_field(fields, path)
     if found is None:
         hint = _like(path, fields)
@@ -126,7 +126,7 @@ def field_named(fields: Mapping[str, TopicField], topic: str, path: str) -> Topi
 
 
 def find_field(fields: Mapping[str, TopicField], path: str) -> TopicField | None:
-    """Return a field or an element of a list field by name. ``None`` means an unknown name."""
+    """Return the field, or the element of a list field, with this name; None for an unknown name."""
     folded = {name.lower(): field for name, field in fields.items()}
     found = fields.get(path) or folded.get(path.lower())
     if found is not None:
@@ -154,7 +154,7 @@ _WHOLE: Final = frozenset(
 
 
 def common_fields(several: Iterable[Mapping[str, str]]) -> dict[str, str]:
-    """Return the fields of a topic in several recordings, with types that can hold the values of each."""
+    """Merge the fields of a topic in several recordings. Each type can hold the values of all."""
     found: dict[str, str] = {}
     for fields in several:
         for name, kind in fields.items():
@@ -163,7 +163,7 @@ def common_fields(several: Iterable[Mapping[str, str]]) -> dict[str, str]:
 
 
 def common_type(one: str, other: str) -> str:
-    """Return a database type that can hold the values of both given types."""
+    """Return a database type that can hold all values of two types."""
     if one == other:
         return one
     if one.endswith("[]") and other.endswith("[]"):
@@ -175,7 +175,7 @@ def common_type(one: str, other: str) -> str:
 
 
 def topics_of_parts(told: Mapping[str, Mapping[str, str]]) -> dict[str, TopicFacts]:
-    """Merge the topics of the stores of a collection. The result has no traces.
+    """Merge the topics of a collection's stores. The result has no list of traces.
 
     Parameters
     ----------

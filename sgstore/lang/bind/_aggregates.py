@@ -1,4 +1,4 @@
-"""Aggregate functions of the query language: ``COUNT``, ``AVG``, ``collect`` and others, over all matches.
+"""Aggregates of the query language over all matches of a query, such as ``COUNT``, ``AVG`` or ``collect``.
 
 They are allowed after ``RETURN``. Unknown values are ignored. Without values, ``COUNT`` and ``SUM`` are 0,
 as in blocks, ``collect`` is an empty list, and the others are NULL.
@@ -62,7 +62,7 @@ def _quantile(inner: str, share: float) -> str:
 
 
 def _collected(inner: str, _: float) -> str:
-    """Return the SQL of the aggregate ``collect``: a list of all values, which is empty without matches.
+    """Return the SQL of the aggregate ``collect``: the list of all values, or an empty list.
 
     With ``DISTINCT`` the list is sorted by value.
     """
@@ -89,13 +89,13 @@ EXTREMES: Final = frozenset({"min", "max"})
 
 
 def is_aggregate(e: s.Call) -> bool:
-    """True if a call aggregates over all matches, as ``max(x)`` does, unlike the function ``max(x, y)``."""
+    """True if a call is an aggregate over all matches, as ``max(x)`` is; ``max(x, y)`` is a plain function."""
     name = normalize_name(e.name)
     return name in AGGREGATES and (name not in EXTREMES or len(e.arguments) == 1)
 
 
 def aggregate(e: s.Call, names: SymbolTable) -> b.Aggregate:
-    """Resolve the names and types in a call of an aggregate such as ``COUNT(x)``; return the bound expression.
+    """Resolve the names and types in a call of an aggregate such as ``COUNT(x)``; return the expression.
 
     Raises
     ------
@@ -139,7 +139,7 @@ def _note_habits(e: s.Call, operand: b.Bound, share: float, names: SymbolTable) 
 
 
 def _share(written: s.Expression, e: s.Call, names: SymbolTable) -> float:
-    """Return the percentage in the second argument of an aggregate call as a fraction from 0 to 1."""
+    """Return the second argument of an aggregate call as a fraction: 0.95 for 95 percent."""
     found = names.bind(written)
     if not isinstance(found, b.Value) or isinstance(found.value, bool | str | None):
         names.session.refuse(
@@ -153,7 +153,7 @@ def _share(written: s.Expression, e: s.Call, names: SymbolTable) -> float:
 
 
 def sql_of(one: b.Aggregate, inner: str) -> str:
-    """Return the SQL of an aggregate such as ``AVG(x)``. ``inner`` is the SQL of its operand."""
+    """Return the SQL of an aggregate such as ``AVG(x)``, from the SQL of its operand (``inner``)."""
     if one.operand is not None and one.operand.type is Type.number and one.word in _REAL:
         inner = f"CAST({inner} AS DOUBLE)"
     if one.distinct:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class CheckInCatalog:
-    """Bound ``CHECK`` statement, with the catalog (of a store or an abstraction) that resolved its names."""
+    """``CHECK`` statement with resolved names, and the catalog (list of known names) that resolved them."""
 
     check: b.BoundCheck
     catalog: Catalog
@@ -41,7 +41,7 @@ def bind_checks(
     seen: Callable[[Statement], Catalog],
     parameters: Mapping[str, Any],
 ) -> tuple[CheckInCatalog, ...]:
-    """Resolve the names and types of every ``CHECK`` in a text.
+    """Resolve the names and types in every ``CHECK`` statement of a text.
 
     A check can use the predicates defined before it.
 
@@ -130,14 +130,14 @@ def _check(written: WrittenCheck, name: str, session: Session, catalog: Catalog)
 
 
 def _knows_no_more(traces: Iterable[TraceFacts], limit: float) -> bool:
-    """True if no trace has data on entities farther from the ego than a limit; m."""
+    """True if no trace has data on entities farther from the ego than the given distance; m."""
     return all(one.reach is not None and one.reach.farthest <= limit for one in traces)
 
 
 def _returned(
     written: WrittenCheck, names: SymbolTable
 ) -> tuple[tuple[b.ReturnColumn, ...], b.Bound | None]:
-    """Return the bound columns of a check's ``RETURN`` clause, and its bound ``HAVING`` condition."""
+    """Return the columns of a check's ``RETURN`` clause, and its ``HAVING`` condition, with resolved names."""
     inner = replace(names, over=True)
     found = tuple(bind_column(item, inner) for item in written.returns)
     taken = [node.name for one in written.quantifiers for node in one.nodes]

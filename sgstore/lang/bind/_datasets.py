@@ -31,7 +31,7 @@ def traces_in(
     *,
     part: bool = False,
 ) -> frozenset[int] | None:
-    """Return the ids of the traces in a dataset, which is a name pattern or a user table.
+    """Return the ids of the traces in a dataset. A dataset is a name pattern or a user table.
 
     ``None`` means an unknown dataset.
 
@@ -72,7 +72,7 @@ def asked(name: str, span: TextSpan, session: Session) -> frozenset[int]:
 def seen_in(
     classes: b.FrameAttribute, name: str, span: TextSpan, session: Session
 ) -> b.FrameAttribute:
-    """Return the condition that the class of a frame's graph also occurs in a dataset.
+    """Return a condition: true if the class of the frame's graph also occurs in a dataset.
 
     Raises
     ------
@@ -100,7 +100,7 @@ def seen_in(
 
 
 def class_count(abstraction: str, *, part: bool = False) -> b.FrameAttribute:
-    """Return the attribute for the number of frames with the same graph class, in the store or collection."""
+    """Return the frame attribute that counts the frames with the same graph class as this frame."""
     attribute = Attribute(
         f"class_count({abstraction})",
         Type.number,
@@ -113,7 +113,7 @@ def class_count(abstraction: str, *, part: bool = False) -> b.FrameAttribute:
 
 
 def abstraction_named(name: str, span: TextSpan, session: Session) -> str:
-    """Return the exact spelling of an abstraction's name. The store must hold its frame classes.
+    """Return the exact name of an abstraction. The store must have the frame classes of this abstraction.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Binder of expressions: resolves names, checks types, and corrects the spelling of known words."""
+"""Binder of expressions: resolves names, checks types, and corrects the spelling of names."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ def _attribute(e: s.AttributeOf, names: SymbolTable) -> b.Bound:
 
 
 def _hint_elsewhere(name: str, known: Sequence[str]) -> str | None:
-    """Return a hint for an attribute that another owner has; None if a known name is similar."""
+    """If an unknown attribute name is known elsewhere, return a hint; otherwise None."""
     if (hint_at(name, known) or "").startswith("did"):
         return None
     if normalize_name(name) in NODE_ATTRIBUTES:
@@ -160,7 +160,7 @@ def _hint_elsewhere(name: str, known: Sequence[str]) -> str | None:
 
 
 def _column(e: s.AttributeOf, names: SymbolTable) -> b.FrameAttribute:
-    """Return the bound expression for a column of a user table: the value in the row of the frame."""
+    """Return the resolved expression for a column of a user table: its value for the frame."""
     table, session = names.session.tables[e.owner.name], names.session
     found = table.attribute(e.name)
     if found is None:
@@ -175,7 +175,7 @@ def _column(e: s.AttributeOf, names: SymbolTable) -> b.FrameAttribute:
 
 
 def _class_attribute(name: str, names: SymbolTable) -> Attribute | None:
-    """Return the attribute ``class_NAME`` (class of a frame in abstraction NAME), or None for another name.
+    """If a name is ``class_X``, return the attribute "class of the frame in abstraction X"; otherwise None.
 
     Its other spelling is ``class('NAME')``.
     """
@@ -200,7 +200,7 @@ def _tail(e: s.AttributeOf) -> TextSpan:
 
 
 def node_attribute(key: str, name: str, span: TextSpan, names: SymbolTable) -> b.NodeAttribute:
-    """Return the bound expression for an attribute of a node, such as ``v.speed``.
+    """Return the resolved expression for an attribute of a node, such as ``v.speed``.
 
     Raises
     ------
@@ -239,7 +239,7 @@ def node_attribute(key: str, name: str, span: TextSpan, names: SymbolTable) -> b
 
 
 def _own_attribute(name: str, own: Mapping[str, Type]) -> Attribute | None:
-    """Return the user-defined attribute with a name, or None.
+    """Return the user-defined attribute with this name, or None.
 
     An exact spelling wins over one that ignores case and underscores.
     """
@@ -250,7 +250,7 @@ def _own_attribute(name: str, own: Mapping[str, Type]) -> Attribute | None:
 
 
 def _no_attribute(name: str) -> str | None:
-    """Return a hint for an unknown attribute name that is a relation or a predicate; otherwise None."""
+    """If an unknown attribute name is a relation or a predicate, return a hint; otherwise None."""
     if relation_named(name):
         return f"it is a relation: EXISTS {{(a)-[:{name}]->(b)}}"
     return call_hint(name)
@@ -260,7 +260,7 @@ FOLLOWED: Final = tuple(frozenset({relation}) for relation in FOLLOWING)
 
 
 def edge_attribute(key: str, name: str, span: TextSpan, names: SymbolTable) -> b.EdgeAttribute:
-    """Return the bound expression for an attribute of an edge.
+    """Return the resolved expression for an attribute of an edge.
 
     Raises
     ------
@@ -322,7 +322,7 @@ def _logic(e: s.Logic, names: SymbolTable) -> b.Operation:
 
 
 def _between(operands: tuple[s.Expression, ...], names: SymbolTable) -> str:
-    """Return the query text between the first and the second operand, which contains the operator."""
+    """Return the query text between two operands. It contains the operator."""
     return names.session.text[operands[0].span.end : operands[1].span.start]
 
 
@@ -378,7 +378,7 @@ def _check_sides(e: s.Comparison, left: b.Bound, right: b.Bound, names: SymbolTa
 
 
 def _of_sides(e: s.Comparison, left: b.Bound, right: b.Bound, names: SymbolTable) -> str | None:
-    """Return a hint for a comparison of values with different types, or None."""
+    """If the sides of a comparison have different types, return a hint; otherwise None."""
     for written, side, other in ((e.left, left, right), (e.right, right, left)):
         if isinstance(written, s.Parameter):
             return f"${written.name} is the {side.type.value} {names.session.parameters[written.name]!r}"
@@ -390,7 +390,7 @@ def _of_sides(e: s.Comparison, left: b.Bound, right: b.Bound, names: SymbolTable
 
 
 def _of_name(e: s.Expression, side: b.Bound, other: b.Bound, names: SymbolTable) -> str | None:
-    """Return a hint to use the attribute ``name`` if a query compares an id with a text; otherwise None."""
+    """If a query compares an id with a text, return the hint to use the attribute ``name``; otherwise None."""
     of_trace = isinstance(side, b.TraceAttribute)
     ids = isinstance(side, b.NodeAttribute | b.TraceAttribute) and side.attribute.name in {
         "id",
@@ -487,7 +487,7 @@ def _membership(e: s.Membership, names: SymbolTable) -> b.Bound:
 
 
 def _in_dataset(operand: b.Bound, e: s.Call, names: SymbolTable) -> b.FrameAttribute:
-    """Return the bound condition ``frame.class IN dataset_classes('train')``.
+    """Return the resolved condition ``frame.class IN dataset_classes('train')``.
 
     A second argument of the function must repeat the abstraction.
     """
@@ -515,7 +515,7 @@ def _in_dataset(operand: b.Bound, e: s.Call, names: SymbolTable) -> b.FrameAttri
 
 
 def _case(e: s.Case, names: SymbolTable) -> b.Operation:
-    """Return the bound form of ``CASE``: condition and value of each branch, then the ``ELSE`` value."""
+    """Return a ``CASE`` with resolved names: condition and value of each branch, then the ``ELSE`` value."""
     operands: list[b.Bound] = []
     written = [branch.value for branch in e.branches]
     written += [e.otherwise] if e.otherwise is not None else []

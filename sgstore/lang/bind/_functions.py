@@ -82,7 +82,7 @@ MAX_CALLS: Final = 30
 
 
 def call(e: s.Call, names: SymbolTable) -> b.Bound:
-    """Resolve the names and types in a call of a function or predicate; return the bound expression.
+    """Resolve the names and types in a call of a function or predicate; return the expression.
 
     Raises
     ------
@@ -133,7 +133,7 @@ def _refuse_aggregate(e: s.Call, names: SymbolTable) -> NoReturn:
 
 
 def _standard(name: str, e: s.Call, names: SymbolTable) -> b.Bound:
-    """Return the bound expression for a call of a predicate from the standard library.
+    """Return the resolved expression for a call of a predicate from the query library.
 
     The library is parsed on first use.
     """
@@ -148,7 +148,7 @@ def _standard(name: str, e: s.Call, names: SymbolTable) -> b.Bound:
 
 
 def _no_function(name: str) -> str | None:
-    """Return a hint for an unknown function name that is an attribute, relation or sequence; otherwise None."""
+    """If an unknown function name is an attribute, relation or sequence, return a hint; otherwise None."""
     word = normalize_name(name)
     if (said := said_of("functions", name)) is not None:
         return said
@@ -325,7 +325,7 @@ def _type(e: s.Call, names: SymbolTable) -> b.EdgeRelation:
 
 
 def _path_function(e: s.Call, names: SymbolTable) -> b.Bound:
-    """Return the bound form of ``nodes(p)``, the list of nodes of a path, or of ``length(p)``."""
+    """Return the resolved call ``nodes(p)`` (list of nodes of a path) or ``length(p)``."""
     _expect(e, 1, 1, names)
     found = names.bind(e.arguments[0])
     if normalize_name(e.name) == "length" and b.items_of(found) is not None:
@@ -401,7 +401,7 @@ def _predicate(e: s.Call, names: SymbolTable) -> b.Bound:
 
 
 def _written(e: s.Call, session: Session) -> str:
-    """Return a call as the query or the library writes it; empty for other arguments than variables there."""
+    """Return the text of a call, as the query or the library writes it."""
     if not session.shipped:
         return " ".join(session.text[e.span.start : e.span.end].split())
     names = [one.name for one in e.arguments if isinstance(one, s.Variable)]

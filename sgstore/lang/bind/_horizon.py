@@ -1,4 +1,4 @@
-"""Horizon of a check: the range around the ego that a trace must cover for a reliable verdict.
+"""Horizon of a check: the range around the ego in which a trace must have all entities.
 
 Unknown entities are in no binding. In ``FORALL (v:Vehicle) ALWAYS dist(ego, v) > 5`` only vehicles within 5 m
 matter, so a trace that covers 50 m around the ego is sufficient. ``FORALL (v:Vehicle) ALWAYS v.speed < 50``
@@ -44,7 +44,7 @@ LINKS: Final = dict.fromkeys(PROXIMITY, 25.0 + BODY) | {
 
 @dataclass(frozen=True, slots=True)
 class Horizon:
-    """Range around the ego that a trace must cover; m.
+    """Range around the ego in which a trace must have all entities; m.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class Horizon:
 
 @dataclass(frozen=True, slots=True)
 class _Place:
-    """Upper bounds on the distance of an entity from the ego, as implied by conditions.
+    """Largest distance of an entity from the ego that some conditions allow.
 
     Attributes
     ----------
@@ -76,23 +76,23 @@ class _Place:
 
     @property
     def reach(self) -> float:
-        """Largest possible distance of the entity from the ego; m."""
+        """Largest distance of the entity from the ego that the conditions allow; m."""
         return min(self.away, self.along) if self.lanes else self.away
 
     def both(self, other: _Place) -> _Place:
-        """Return the distance bounds of an entity that meets the conditions of both ``self`` and ``other``."""
+        """Return the largest distance of an entity that meets both groups of conditions."""
         lanes = self.lanes or other.lanes
         return _Place(min(self.away, other.away), min(self.along, other.along), lanes)
 
     def either(self, other: _Place) -> _Place:
-        """Return the distance bounds of an entity that meets the conditions of ``self`` or of ``other``."""
+        """Return the largest distance of an entity that meets at least one of two groups of conditions."""
         lanes = self.lanes and other.lanes
         away = max(self.reach, other.reach)
         return _Place(away, max(self.along, other.along), lanes)
 
 
 def horizon(check: BoundCheck, speed: float = FASTEST) -> Horizon:
-    """Return the range around the ego that can influence the verdict of a check.
+    """Return the range around the ego in which entities can change the verdict of a check.
 
     Parameters
     ----------
@@ -123,9 +123,7 @@ def horizon(check: BoundCheck, speed: float = FASTEST) -> Horizon:
 
 
 def spoken_kinds(check: BoundCheck) -> tuple[frozenset[str], frozenset[str]]:
-    """Return the node kinds whose absence can make a check wrongly true, and those that make it wrongly false.
-
-    The result is a pair of sets.
+    """Return two sets of node kinds. Without these nodes, a check can be wrongly true, or wrongly false.
 
     Parameters
     ----------
@@ -152,7 +150,7 @@ def _farther(found: Horizon, reach: float, *, true: bool, false: bool) -> Horizo
 
 @dataclass(frozen=True, slots=True)
 class _Missed:
-    """Pattern node that a recording may lack: its kinds, its largest distance, the wrong verdicts it can cause.
+    """Pattern node that may be missing in a recording, and the wrong verdicts that this can cause.
 
     ``true`` and ``false`` are set if a missing node can cause that wrong verdict.
     """
@@ -164,13 +162,13 @@ class _Missed:
 
     @property
     def either(self) -> _Missed:
-        """Return a copy in which a missing node can make the verdict wrongly true and wrongly false."""
+        """Return a copy for which the missing node can cause both wrong verdicts."""
         return replace(self, true=True, false=True)
 
 
 @dataclass(slots=True)
 class _Looking:
-    """Analysis of a check.
+    """Analysis of a check: the distances from the ego up to which its entities matter.
 
     Attributes
     ----------
@@ -189,7 +187,7 @@ class _Looking:
     def blocks(  # noqa: C901, PLR0912 - a case each
         self, formula: Bound, *, up: bool = True
     ) -> Iterable[_Missed]:
-        """Yield the nodes in the patterns in braces of a formula, such as ``EXISTS {…}``.
+        """Yield the nodes of all patterns in braces, such as ``EXISTS {…}``, in a formula.
 
         Each has the wrong verdicts that a missing node can cause.
 
@@ -222,7 +220,7 @@ class _Looking:
                             yield one.either
 
     def of_block(self, block: b.BlockValue, *, up: bool) -> Iterable[_Missed]:
-        """Yield the nodes of a pattern in braces, with the wrong verdicts that a missing node can cause.
+        """Yield the nodes of a pattern in braces, with the wrong verdicts that their absence can cause.
 
         A missing node makes ``EXISTS`` false and ``COUNT`` smaller.
         """
@@ -241,7 +239,7 @@ class _Looking:
             yield from inner.blocks(part, up=up)
 
     def in_scope(self, scope: Scope, key: str) -> _Place:
-        """Return bounds on the distance between the ego and a node of a matched pattern."""
+        """Return the largest distance between the ego and a node of a matched pattern."""
         found = _Place()
         for part in scope.where:
             found = found.both(self.place(part, key, wanted=True))
@@ -258,7 +256,7 @@ class _Looking:
         return found
 
     def _is_joined(self, scope: Scope, key: str) -> bool:
-        """True if edges connect a node of a pattern to another one whose distance from the ego is limited."""
+        """True if edges connect a node of a pattern to a node whose distance from the ego is limited."""
         reached, grown = {key}, True
         while grown:
             fresh = {
@@ -277,7 +275,7 @@ class _Looking:
     def place(  # noqa: PLR0911 - a case each
         self, formula: Bound, key: str, *, wanted: bool, later: bool = False
     ) -> _Place:
-        """Return bounds on the distance between ego and entity that follow from a formula.
+        """Return the largest distance of an entity from the ego that a formula allows.
 
         The formula is true or false, as ``wanted``. ``later``: true if the frame is not the last one.
         """
@@ -316,7 +314,7 @@ class _Looking:
         return found.both(self._measured(MIRRORED[word], other, one, key))
 
     def _measured(self, word: str, one: Bound, other: Bound, key: str) -> _Place:
-        """Return bounds on the distance of an entity from the ego, from a comparison: ``dist(e, v) < 20``."""
+        """Return the largest distance of an entity from the ego that ``dist(e, v) < 20`` or similar allows."""
         whole = isinstance(one, b.Operation) and one.word == "abs"
         pair = one.operands[0] if isinstance(one, b.Operation) and whole else one
         if not isinstance(pair, b.PairNumber) or key not in {pair.a, pair.b}:
@@ -340,7 +338,7 @@ class _Looking:
 
 
 def _goes_on(formula: Bound, *, wanted: bool) -> bool:
-    """True if a formula can have its value only if a later frame exists."""
+    """True if a formula can have the wanted value (true or false) only before the last frame."""
     match formula:
         case b.Tense(word="NEXT" | "WEAKNEXT"):
             return wanted == (formula.word == "NEXT")
@@ -355,7 +353,7 @@ def _goes_on(formula: Bound, *, wanted: bool) -> bool:
 
 
 def _may_be_empty(tense: b.Tense, *, wanted: bool) -> bool:
-    """True if a temporal operator has its value already because its time window contains no frame.
+    """True if a temporal operator has the wanted value in case no frame lies in its time window.
 
     Examples: ``NEXT`` in the last frame is false, ``HISTORICALLY[1s, 2s]`` in the first frame is true.
     """
@@ -382,7 +380,7 @@ _COMPLEMENT: Final = {"<": ">=", "<=": ">", ">": "<=", ">=": "<", "=": "<>", "<>
 
 
 def _safe(margin: float, speed: float) -> float:
-    """Return the largest RSS safe distance of two oncoming vehicles for a margin and a maximum speed; m."""
+    """Return the largest RSS safe distance between two oncoming vehicles; m."""
     fast = speed + 3.5
     return margin + 2 * (speed + 1.75) + fast * fast / 6 + fast * fast / 8 + BODY
 
@@ -404,7 +402,7 @@ _BRAKING: Final = {"a_long_req": -1.0, "drac": 1.0, "btn": 11.5}
 
 
 def bounds(value: Bound, speed: float) -> Interval:
-    """Return the smallest and largest possible value of a numeric expression, for a maximum speed of vehicles.
+    """Return the smallest and the largest possible value of a numeric expression.
 
     Parameters
     ----------

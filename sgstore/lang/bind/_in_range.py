@@ -1,4 +1,4 @@
-"""Condition ``in_range(a, b)``: true if the scene graph generator computed relations for two nodes.
+"""Condition ``in_range(a, b)``: true if sgstore computed relations between the two nodes.
 
 A scene graph relates only the pairs selected by the settings of its trace: the ego and entities in range,
 moving entities and entities near them. For such a pair, a missing edge means that the relation does not hold.
@@ -41,7 +41,7 @@ _VEHICLE: Final = any_kinds().only(frozenset(VEHICLES))
 
 
 def in_range(a: str, b: str, traces: Iterable[TraceFacts]) -> Bound:
-    """Return the condition that the scene graph generator computed relations for two nodes.
+    """Return a condition: true if sgstore computed relations between the two nodes.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def in_range(a: str, b: str, traces: Iterable[TraceFacts]) -> Bound:
 
 
 def scopes_of(traces: Iterable[TraceFacts]) -> b.Scopes:
-    """Group traces by relation scope (setting of entity pairs): each scope with the ids of its traces."""
+    """Group traces by the settings that select entity pairs. Return each setting with its trace ids."""
     of: dict[RelationScope | None, list[int]] = {}
     for trace in traces:
         of.setdefault(trace.reach, []).append(trace.trace_id)
@@ -67,7 +67,7 @@ def scopes_of(traces: Iterable[TraceFacts]) -> b.Scopes:
 
 
 def in_traces(scopes: b.Scopes, condition: Callable[[RelationScope | None], Bound]) -> Bound:
-    """Return one condition for all traces, from one for each relation scope (setting of entity pairs)."""
+    """Return one condition for all traces, joined from the condition for each pair setting."""
     if len(scopes) < 2:
         return condition(next(reach for reach, _ in scopes))
     number = TraceAttribute(TRACE_ATTRIBUTES["id"], Type.number)
@@ -75,7 +75,7 @@ def in_traces(scopes: b.Scopes, condition: Callable[[RelationScope | None], Boun
 
 
 def related(a: str, b: str, reach: RelationScope | None) -> Bound:
-    """Return the condition that relations of two nodes were computed, for given settings of entity pairs."""
+    """Return a condition: true if relations of two nodes were computed with the given pair settings."""
     if reach is None:
         return Value(None, Type.boolean)
     ego = any_of(LabelTest(node, ego_kinds()) for node in (a, b))
@@ -97,7 +97,7 @@ def related(a: str, b: str, reach: RelationScope | None) -> Bound:
 
 
 def _listed(a: str, b: str, kinds: Iterable[tuple[str, ...]]) -> list[Bound]:
-    """Return the condition that two nodes have one of the listed pairs of labels.
+    """Return a condition: true if the labels of two nodes are one of the listed pairs.
 
     The result is a list of one condition, or empty without pairs.
     """
@@ -110,7 +110,7 @@ def _listed(a: str, b: str, kinds: Iterable[tuple[str, ...]]) -> list[Bound]:
 
 
 def bounded(a: str, b: str, names: Iterable[str], reach: RelationScope) -> Bound:
-    """Return the condition that two entities have one of the given distance relations, such as ``near``.
+    """Return a condition: true if two entities have one of the given distance relations, such as ``near``.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ def bounded(a: str, b: str, names: Iterable[str], reach: RelationScope) -> Bound
 
 
 def _touch(a: str, b: str, reach: RelationScope) -> Bound:
-    """Return the condition that the bodies of two entities touch, and at least one of the entities moves."""
+    """Return a condition: true if the bodies of two entities touch, and at least one of them moves."""
     solid = [inverse(LabelTest(node, _SIGNAL)) for node in (a, b)]
     moves = any_of(inverse(_still(node)) for node in (a, b))
     ego = [] if reach.within > 0 else [any_of(LabelTest(node, ego_kinds()) for node in (a, b))]
@@ -157,7 +157,7 @@ def _labelled(label: str) -> Kinds:
 
 
 def _up_to(a: str, b: str, bound: float, reach: RelationScope) -> Bound:
-    """Return the condition that the distance of two nodes has an upper bound.
+    """Return a condition: true if the distance of two nodes is at most the limit.
 
     Without a position it is false.
     """
@@ -173,7 +173,7 @@ def _up_to(a: str, b: str, bound: float, reach: RelationScope) -> Bound:
 
 
 def _between_origins(a: str, b: str) -> Iterable[tuple[list[Bound], Bound]]:
-    """Yield distances between the origins of two nodes, each with its conditions.
+    """Yield formulas for the distance between the origins of two nodes, each with its conditions.
 
     The origin of a moving vehicle is on the ground.
     """

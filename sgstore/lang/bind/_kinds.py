@@ -1,4 +1,4 @@
-"""Kinds of nodes (such as car or lane): the tables that store them, and restrictions by conditions."""
+"""Kinds of nodes, such as car or lane: the tables that store them, and SQL that selects them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _FEW: Final = 4
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """Kinds of node that a query variable can match, grouped by the table that stores these nodes."""
+    """Kinds of node that a query variable can match, grouped by the table that stores such nodes."""
 
     moving: frozenset[str]
     fixed: frozenset[str]
@@ -33,7 +33,7 @@ class Profile:
 
     @classmethod
     def of(cls, kinds: Kinds, catalog: Catalog) -> Profile:
-        """Return the profile for a set of kinds: the kinds grouped by the table that stores their nodes.
+        """Group some kinds of node by the table that stores such nodes.
 
         Unused entity kinds count as moving, other unused kinds as mapped.
         """
@@ -46,7 +46,7 @@ class Profile:
 
     @property
     def kinds(self) -> frozenset[str]:
-        """All kinds of node in the profile, from all tables."""
+        """All kinds of node that the query variable can match, from all tables."""
         return self.moving | self.fixed | self.mapped
 
     @property
@@ -55,7 +55,7 @@ class Profile:
         return sum(map(bool, (self.moving, self.fixed, self.mapped)))
 
     def has(self, home: Home) -> bool:
-        """True if the nodes may have values in the given table."""
+        """True if a table may have values of these nodes."""
         kinds = {
             Home.state: self.moving,
             Home.entity: self.moving | self.fixed,
@@ -66,7 +66,7 @@ class Profile:
 
 
 def homes_of(attribute: Attribute, profile: Profile) -> set[Home]:
-    """Return the tables to join in SQL for an attribute of nodes of some kinds.
+    """Return the tables to join in SQL to read an attribute of nodes of some kinds.
 
     The state of a moving entity is joined anyway. So a constant that states repeat is read from the state.
     """
@@ -78,7 +78,7 @@ def homes_of(attribute: Attribute, profile: Profile) -> set[Home]:
 
 
 def kind_conditions(kinds: Kinds, kind: str, ego: str | None, held: frozenset[str]) -> list[str]:
-    """Return SQL conditions that restrict the kind of a node, and if it is the ego.
+    """Return SQL conditions that select rows by the kind of a node, and by its being the ego or not.
 
     ``ego=None`` means that no row is the ego.
 
@@ -105,7 +105,7 @@ def _among(kinds: frozenset[str], column: str, held: frozenset[str]) -> list[str
 
 
 def _one_of(column: str, words: list[str], others: Sequence[str] = ()) -> str:
-    """Return the SQL condition that a column equals one of some words.
+    """Return the SQL condition that a column is one of some words.
 
     ``others`` are the other possible words.
     """
@@ -119,7 +119,7 @@ def _one_of(column: str, words: list[str], others: Sequence[str] = ()) -> str:
 def edge_conditions(
     catalog: Catalog, scope: Scope, edge: Edge, alias: str, *, moving: bool, swapped: bool = False
 ) -> list[str]:
-    """Return SQL conditions for the rows of an edge table: allowed relations, and allowed kinds of both nodes.
+    """Return SQL conditions that select rows of an edge table by relation, and by the kinds of both nodes.
 
     The table is ``edge`` or ``map_edge``.
 
@@ -146,14 +146,14 @@ def edge_conditions(
 
 
 def alias_of(edge: Edge) -> str:
-    """Return the SQL alias of a pattern edge: its key, plus its relation if it has only one."""
+    """Return the SQL alias of a pattern edge: its key, and its relation if it can have only one."""
     return (
         f"{edge.key}:{next(iter(edge.relations))}" if len(edge.relations) == 1 else f"{edge.key}:"
     )
 
 
 def entities_of_pairs(scope: Scope, _: Catalog) -> Scope:
-    """Return a scope in which nodes must be entities if a condition compares a number of their pair.
+    """Return a pattern whose nodes must be entities if a condition compares a number of two of them.
 
     An example is ``ttc(a, b) < 2``.
 
@@ -171,7 +171,7 @@ def entities_of_pairs(scope: Scope, _: Catalog) -> Scope:
 
 
 def on_lanes() -> frozenset[str]:
-    """Return the kinds of nodes that lie on lanes: entities, and parts of the map."""
+    """Return the kinds of nodes that have places on lanes: entities, and parts of the map."""
     return entity_kinds() | _ON_LANES
 
 
@@ -179,7 +179,7 @@ _ON_LANES: Final = frozenset({"lane", "road", "junction", "roundabout", "crosswa
 
 
 def _needed(expression: Bound) -> Iterator[PairNumber]:
-    """Yield the pair numbers, such as ``ttc(a, b)``, that must be known for an expression to have a value."""
+    """Yield the numbers of entity pairs, such as ``ttc(a, b)``, without which an expression has no value."""
     match expression:
         case PairNumber():
             yield expression

@@ -1,4 +1,4 @@
-"""Binder of values over the frames of a match, such as ``MIN(ttc(e, v)) OVER match`` or ``OVER cutin``."""
+"""Binder of aggregates over the frames of a match, such as ``MIN(ttc(e, v)) OVER match``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _VALUES: Final = frozenset({Type.number, Type.text, Type.boolean})
 
 
 def over_match(e: s.OverExpression, names: SymbolTable) -> b.OverMatch:
-    """Return the bound form of an aggregate over the frames of a match, or over some of its steps.
+    """Return the resolved aggregate over the frames of a match, or over some of its steps.
 
     Raises
     ------
@@ -98,7 +98,7 @@ def _seconds() -> b.Bound:
 
 
 def _range(e: s.OverExpression, names: SymbolTable) -> tuple[int | None, int | None]:
-    """Return the numbers of the first and last step in an ``OVER`` clause. ``None`` means the whole match."""
+    """Return the numbers of the first and last step in an ``OVER`` clause; None for ``OVER match``."""
     if e.start is None:
         return None, None
     start = _step(e.start, names)

@@ -1,4 +1,4 @@
-"""Needs of a query or check: the values that a trace must contain for an answer, such as an ego or speeds.
+"""Data that a query or check needs: a trace without these values, such as speeds, gives no answer.
 
 An unknown condition is not true, and inside temporal operators it is false. So ``ALWAYS ego.speed < 20``
 would be false for a trace without an ego or without speeds. Such a trace cannot answer: it is left out, and
@@ -54,7 +54,7 @@ _TELLS: Final = frozenset({"IS NULL", "IS NOT NULL", "coalesce", "case"})
 
 @dataclass(frozen=True, slots=True)
 class Need:
-    """Data that a trace must contain for a query or check: an attribute, an event, an ego or a map.
+    """Data that a query or check needs from a trace: an attribute, an event, an ego or a map.
 
     Attributes
     ----------
@@ -79,12 +79,12 @@ class Need:
 
     @property
     def is_ego(self) -> bool:
-        """True if the required data is the ego vehicle itself, and not an attribute, event or map."""
+        """True if the needed data is the ego vehicle, and not an attribute, event or map."""
         return self.attribute is None and not self.event and not self.lanes
 
     @property
     def reason(self) -> str:
-        """Message that explains which required data a trace lacks."""
+        """Message about the needed data that a trace does not have."""
         if self.lanes:
             return (
                 "it has no map with heights" if self.lanes == "slope" else "it has no map of lanes"
@@ -98,13 +98,13 @@ class Need:
         return f"{self.attribute.name}{of} never has a value"
 
     def reason_in(self, trace: str) -> str:
-        """Message that explains which required data the trace with this name lacks."""
+        """Return a message about the needed data that the trace with this name does not have."""
         value = self.attribute and self.attribute.topic
         return f"trace {trace} has no topic {value.topic}" if value else self.reason
 
 
 def of_check(check: BoundCheck) -> tuple[Need, ...]:
-    """Return the data that a trace must contain for a check.
+    """Return the data that a check needs from a trace.
 
     The result is empty with ``USING UNKNOWN false``.
     """
@@ -119,7 +119,7 @@ def of_check(check: BoundCheck) -> tuple[Need, ...]:
 
 
 def not_computed(check: BoundCheck, facts: TraceFacts) -> str:
-    """Return a message about relations that a check uses and a trace lacks, or an empty text."""
+    """Return a message about the relations that a check uses and a trace does not have, or an empty text."""
     if check.unknown_is_false:
         return ""
     missing = check.relations - facts.answers
@@ -150,7 +150,7 @@ def _of_entities(expression: Bound) -> frozenset[str]:
 
 
 def of_query(query: b.Query) -> tuple[Need, ...]:
-    """Return the data that a trace must contain so that a query can have a match in it.
+    """Return the data without which a trace cannot have a match of the query.
 
     For an ``OR`` without temporal operators, only needs common to all its conditions count.
     """
@@ -188,7 +188,7 @@ def _of_each(
 def _needed(  # noqa: C901, PLR0911, PLR0912 - a case each
     expression: b.Bound, nodes: Mapping[str, b.Node], *, strict: bool
 ) -> set[Need]:
-    """Return the data that a trace must contain for an expression.
+    """Return the data that an expression needs from a trace.
 
     If ``strict``, all operands count, even of an ``OR``.
     """

@@ -1,4 +1,4 @@
-"""Binder of graph patterns: resolves the nodes, edges, labels and blocks (patterns in braces)."""
+"""Binder of graph patterns: resolves nodes, edges, labels and patterns in braces."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from sgstore.model.vocabulary import (
 
 
 def bind_block(block: s.Block, names: SymbolTable) -> None:
-    """Add the paths and the condition of a graph pattern to the current scope, with names resolved.
+    """Resolve the names in the paths and the condition of a pattern, and add both to the current pattern.
 
     All nodes and edges are bound before any condition. So a condition inside a node can use later nodes.
     """
@@ -107,7 +107,7 @@ def _node(node: s.NodePattern, names: SymbolTable) -> str:
 
 
 def _refuse_bare_label(node: s.NodePattern, names: SymbolTable) -> None:
-    """Raise an error for ``(Car)``, a node with the name of a label. The user probably means ``(:Car)``."""
+    """Raise an error for ``(Car)``, a node with a label as its name. The user probably means ``(:Car)``."""
     if node.name and node.name[0].isupper() and not node.label and node.name in labels():
         names.session.refuse(
             f"({node.name}) matches any node and names it {node.name}",
@@ -117,10 +117,7 @@ def _refuse_bare_label(node: s.NodePattern, names: SymbolTable) -> None:
 
 
 def _known_node(node: s.NodePattern, names: SymbolTable) -> str | None:
-    """Return the key of a pattern node whose name is known from earlier in the query.
-
-    ``None`` means a new node.
-    """
+    """Return the key of a pattern node if an earlier part of the query defines its name; otherwise None."""
     if node.name is None:
         return None
     if node.name in RESERVED:
@@ -135,7 +132,7 @@ def _known_node(node: s.NodePattern, names: SymbolTable) -> str | None:
 
 
 def _the_ego(node: s.NodePattern, names: SymbolTable) -> str | None:
-    """Return the key of the ego vehicle if a pattern node has the reserved name ``ego``; otherwise None."""
+    """If a pattern node has the name ``ego``, return the key of the ego vehicle; otherwise None."""
     if node.name != THE_EGO:
         return None
     if names.scope.parent is None:
@@ -192,7 +189,7 @@ def _edge(edge: s.EdgePattern, left: str, right: str, names: SymbolTable) -> str
 
 
 def _inline(pattern: s.NodePattern | s.EdgePattern, key: str, names: SymbolTable) -> None:
-    """Add the properties and the condition written inside a node or edge to the current scope."""
+    """Add the properties and the condition inside a node or edge to the conditions of the pattern."""
     for prop in pattern.properties:
         attribute_of = node_attribute if isinstance(pattern, s.NodePattern) else edge_attribute
         attribute = attribute_of(key, prop.name, prop.name_span, names)
@@ -202,7 +199,7 @@ def _inline(pattern: s.NodePattern | s.EdgePattern, key: str, names: SymbolTable
 
 
 def _equality(attribute: b.Bound, prop: s.Property, names: SymbolTable) -> b.Bound:
-    """Return the bound comparison for a property ``name: value`` of a node or edge.
+    """Return the condition ``attribute = value`` for a property ``name: value``, with names resolved.
 
     The attribute gets an internal name that queries cannot use.
     """

@@ -1,4 +1,4 @@
-"""Patterns and conditions that no recorded trace can have: wrong ends of a relation, values out of range.
+"""Errors for patterns that no recording can match: wrong nodes of a relation, values out of range.
 
 The relations that sgstore computes join only some kinds of nodes, and most numbers have a range. A pattern or a
 condition outside of these never holds, so the binder rejects it. Graphs of other tools and relations of clients
@@ -62,7 +62,7 @@ _ENDS: Final[Mapping[str, Ends]] = {
 
 
 def check_edges(written: Sequence[Written], names: SymbolTable) -> None:
-    """Raise an error for an edge of a pattern that no recording can have.
+    """Raise an error if no recording can have an edge of a pattern.
 
     The kinds that remain for each node are stored for :func:`check_comparison`.
 
@@ -103,14 +103,14 @@ def check_edges(written: Sequence[Written], names: SymbolTable) -> None:
 
 
 def _sort(kinds: b.Kinds) -> b.Kinds:
-    """Widen the kinds to all entities if they include some entities."""
+    """If some kinds include an entity kind, return them with all entity kinds added."""
     return kinds | _WORDS["entity"] if kinds.other & _OWN else kinds
 
 
 def _ways(
     edge: b.Edge, src: b.Kinds, dst: b.Kinds, ends: Sequence[tuple[b.Kinds, b.Kinds]]
 ) -> list[tuple[b.Kinds, b.Kinds]]:
-    """Return the pairs of kinds (source, destination) that an edge, also a repeated one, can join."""
+    """Return the pairs of kinds (source, destination) that an edge or a path of such edges can connect."""
     ends = [*ends, *((other, one) for one, other in ends)] if edge.both else ends
     found: list[tuple[b.Kinds, b.Kinds]] = []
     reached = [src]
@@ -138,7 +138,7 @@ def _refuse_edge(
 def _correct_edge(
     edge: b.Edge, kinds: tuple[b.Kinds, b.Kinds], texts: tuple[str, str, str], direction: str
 ) -> str:
-    """Return a hint to correct an impossible edge: turn, repeat or replace it, or use other nodes."""
+    """Return a hint for an impossible edge: reverse, repeat or replace it, or use other nodes."""
     src, dst = kinds
     of = {name: _ENDS[name] for name in RELATION_ENDS if name in edge.relations}
     ends = [pair for some in of.values() for pair in some]
@@ -162,7 +162,7 @@ def _correct_edge(
 
 
 def _told(relation: str) -> str:
-    """Return the kinds at the ends of a relation as text, such as ``a lane to a road``."""
+    """Return, as text, the kinds of node that a relation connects, such as ``a lane to a road``."""
     pairs = RELATION_ENDS[relation]
     text = ", or from ".join(f"{one} to {other}" for one, other in pairs)
     return text.replace("|", ", ").replace("body", "entity")
@@ -222,7 +222,7 @@ def limits(value: b.Bound) -> Interval:
 
 
 def check_comparison(e: s.Expression, found: b.Bound, names: SymbolTable) -> b.Bound:
-    """Return a comparison, or raise an error if no recorded value can make it true.
+    """Return a comparison. Raise an error if no recorded value can make it true.
 
     A comparison that always holds gets a note.
 
@@ -265,7 +265,7 @@ def check_comparison(e: s.Expression, found: b.Bound, names: SymbolTable) -> b.B
 
 
 def _range(low: float, high: float, constant: b.Value) -> str:
-    """Return the valid range of an attribute as text, with a hint for a value in the wrong unit."""
+    """Return the valid range of an attribute as text, and a hint if the value has the wrong unit."""
     number = float(constant.shown or 0)
     text = (
         f"it is at least {low:g}" if high == math.inf else f"it lies between {low:g} and {high:g}"
@@ -282,7 +282,7 @@ def _range(low: float, high: float, constant: b.Value) -> str:
 
 
 def _wrong_words(left: b.Bound, word: str, texts: set[str], names: SymbolTable) -> tuple[str, str]:
-    """Return ``never`` or ``always`` and a hint, for a comparison with a kind or relation that cannot occur."""
+    """If a compared kind or relation cannot occur, return ``never`` or ``always``, and a hint."""
     possible, hint = None, ""
     if isinstance(left, b.NodeAttribute) and left.attribute.name == "kind":
         possible = (names.session.kinds_left.get(left.node) or names.scope.kinds(left.node)).every

@@ -1,4 +1,4 @@
-"""Precision of comparisons: numbers are rounded like the stored values with which they are compared.
+"""Precision of comparisons: a number is rounded in the same way as the stored value.
 
 The store keeps most attributes of nodes and edges in 32 bits, so a car whose width is 1.8 m has the width
 1.7999999523162842. The compared number is rounded to 32 bits first. Times since the
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class Precision(Enum):
-    """Rounding of a number before a comparison. The member value is the name of the rounding operator."""
+    """Rounding of a number before it is compared. Each value is the name of the rounding operator."""
 
     float32 = "float32"
     microseconds = "microseconds"
@@ -45,7 +45,7 @@ _OVER_TIME: Final = frozenset({"prev", "min_over", "max_over", "avg_over"})
 
 
 def precision_of(value: b.Bound) -> Precision | None:
-    """Return the precision with which the store keeps an expression's value.
+    """Return the precision with which the store saves the value of an expression.
 
     ``None`` means computed in 64 bits.
     """
@@ -66,10 +66,7 @@ def precision_of(value: b.Bound) -> Precision | None:
 
 
 def _of_whole(attribute: Attribute) -> Precision | None:
-    """Return the stored precision of an attribute. ``None`` means 64 bits.
-
-    ``None`` means 64 bits.
-    """
+    """Return the precision with which the store saves an attribute; None for 64 bits."""
     if attribute.precision:
         return Precision(attribute.precision)
     timed = attribute.unit in {DisplayUnit.seconds, DisplayUnit.span}
@@ -77,7 +74,7 @@ def _of_whole(attribute: Attribute) -> Precision | None:
 
 
 def _of_many(value: b.Bound) -> Precision | None:
-    """Return the stored precision of a value that is chosen from several values. ``None`` means 64 bits."""
+    """If an expression selects one of several values, return their stored precision; None for 64 bits."""
     match value:
         case b.OverMatch(word="argmin" | "argmax", at=at) if at is not None:
             return precision_of(at)
@@ -94,13 +91,13 @@ def _of_many(value: b.Bound) -> Precision | None:
 
 
 def _common(operands: tuple[b.Bound, ...]) -> Precision | None:
-    """Return the precision that all operands share, ignoring constants. ``None`` if they differ."""
+    """Return the precision of all operands except constants; None if it differs."""
     found = {precision_of(one) for one in operands if not isinstance(one, b.Value)}
     return found.pop() if len(found) == 1 else None
 
 
 def is_stored(value: b.Bound) -> bool:
-    """True if a value is a 32-bit number from the store, or is selected from such numbers."""
+    """True if a value is a 32-bit number of the store, or one of several such numbers."""
     return precision_of(value) is Precision.float32 and not any(
         _is_computed(part) for part in b.walk(value)
     )
@@ -121,7 +118,7 @@ def _is_computed(part: b.Bound) -> bool:
 
 
 def compared(*sides: b.Bound) -> tuple[b.Bound, ...]:
-    """Return the sides of a comparison, rounded to the lowest precision among them."""
+    """Return both sides of a comparison, rounded to the lower precision of the two."""
     known = {precision_of(side) for side in sides} - {None}
     for precision in Precision:
         if precision in known:
@@ -130,7 +127,7 @@ def compared(*sides: b.Bound) -> tuple[b.Bound, ...]:
 
 
 def chosen(value: b.Bound, choices: b.Choices) -> tuple[b.Bound, b.Choices]:
-    """Return a value and the constants of its ``IN`` list, rounded to the lowest precision among them."""
+    """Return a value and the constants of its ``IN`` list, all rounded to the lowest precision among them."""
     operand, *items = compared(value, *choices.items)
     return operand, b.Choices(tuple(item for item in items if isinstance(item, b.Value)))
 
@@ -147,7 +144,7 @@ def _rounded(value: b.Bound, precision: Precision) -> b.Bound:
 
 
 def _is_exact(value: b.Bound, precision: Precision) -> bool:
-    """True if a stored value already has the given precision, so that rounding is unnecessary."""
+    """True if a stored value has the given precision already and needs no rounding."""
     if precision_of(value) is not precision:
         return False
     if isinstance(value, b.Operation) and value.word in {"abs", "negative"}:

@@ -1,4 +1,4 @@
-"""Binder of queries: resolves names and types of a parsed ``MATCH`` and its settings.
+"""Binder of queries: resolves the names and types of a ``MATCH`` statement and its settings.
 
 The binder and the parser find all errors of the user, before any SQL is built.
 """
@@ -53,7 +53,7 @@ SCOPES: Final = ("graph", "world")
 def bind_query(
     text: str, statements: Sequence[s.Statement], catalog: Catalog, parameters: Mapping[str, Any]
 ) -> b.Query:
-    """Return the bound query of a text with one ``MATCH``: names resolved, types known.
+    """Return the query of a text with one ``MATCH``. Its names are resolved, and its types are known.
 
     The text may also define predicates.
 
@@ -105,7 +105,7 @@ def bind_query(
 
 
 def _merged_names(query: b.Query, catalog: Catalog) -> list[str]:
-    """Return a note if a query groups by an entity's name or id, which are unique only within one trace."""
+    """If a query groups by an entity's name or id, return a note: they are unique only in one trace."""
     values = [column.value for column in query.result.columns]
     parts = [part for value in values for part in b.walk(value)]
     grouped = query.result.distinct or any(isinstance(part, b.Aggregate) for part in parts)
@@ -151,7 +151,7 @@ def _of_match(match: s.MatchClause, session: Session) -> b.Query:
 
 
 def _is_plain(match: s.MatchClause) -> bool:
-    """True if a query has only one step (one pattern for single frames), without a duration or a name."""
+    """True if a query is for single frames: one step without a duration or a name."""
     first = match.sequence.steps[0]
     if len(match.sequence.steps) > 1 or not isinstance(first, s.StepClause):
         return False
@@ -159,7 +159,7 @@ def _is_plain(match: s.MatchClause) -> bool:
 
 
 def _of_one_step(match: s.MatchClause, session: Session) -> b.Query:
-    """Return the bound query of a pattern for single frames.
+    """Return the resolved query of a pattern for single frames.
 
     If it uses other frames, the result is a sequence of one step.
     """
@@ -177,7 +177,7 @@ def _of_one_step(match: s.MatchClause, session: Session) -> b.Query:
 
 
 def _of_steps(match: s.MatchClause, session: Session) -> b.Query:
-    """Return the bound query of a sequence of steps (patterns that match one after another)."""
+    """Return the resolved query of a sequence: steps whose patterns match one after another."""
     returned = names_returned(match.returns)
     found = bind_sequence(match.sequence, session, bind_block, returned)
     names = SymbolTable(session, found.scope(), found.meanings)
@@ -191,7 +191,7 @@ def _of_steps(match: s.MatchClause, session: Session) -> b.Query:
 
 
 def _told(scope: b.Scope) -> b.Scope:
-    """Return the nodes and edges that a match reports: named ones, the ends of named edges, and the ego."""
+    """Return the nodes and edges that a match reports: those with names, the ego, and nodes of named edges."""
     edges = tuple(edge for edge in scope.edges if edge.named)
     ends = {end for edge in edges for end in (edge.src, edge.dst)}
     told = {
@@ -232,7 +232,7 @@ def _only_match(statements: Sequence[s.Statement], session: Session) -> s.MatchC
 
 
 def define(statement: s.Define, session: Session) -> None:
-    """Add a predicate or scenario that the query text defines to the known names.
+    """Add a predicate or scenario defined in the query text to the known names.
 
     Duplicate names raise an error.
 
@@ -252,7 +252,7 @@ def define(statement: s.Define, session: Session) -> None:
 
 @dataclass(slots=True)
 class UsingChoice:
-    """Settings from the ``USING`` clauses of a statement. ``None`` means that a setting is absent."""
+    """Settings from the ``USING`` clauses of a statement, with None for absent settings."""
 
     ego: str | None = None
     unknown_is_false: bool = False
@@ -307,7 +307,7 @@ _CHOICES: Final = {
 
 
 def _choose(found: UsingChoice, setting: s.Setting, value: str, session: Session) -> None:
-    """Store one ``USING`` setting whose value must be one of some fixed words, such as ``NODES any``."""
+    """Store a ``USING`` setting whose value is one of a few fixed words, such as ``NODES any``."""
     name, word = normalize_name(setting.name), value.lower()
     if word not in _CHOICES[name]:
         session.unknown(f"value of {setting.name}", value, setting.span, _CHOICES[name])
@@ -327,7 +327,7 @@ def _choose(found: UsingChoice, setting: s.Setting, value: str, session: Session
 
 
 def _metres(value: str, setting: s.Setting, session: Session) -> float:
-    """Return the distance of ``USING RANGE``, the range of a check around the ego; m."""
+    """Return the distance of ``USING RANGE``: a check uses only entities within it; m."""
     try:
         metres = float(value)
     except ValueError:
@@ -356,7 +356,7 @@ def refuse_unused(session: Session) -> None:
 
 
 def refuse_strange(session: Session, catalog: Catalog) -> None:
-    """Raise an error if the query uses a relation that the abstraction (kind of scene graph) lacks."""
+    """Raise an error if the query uses a relation that does not exist in the abstraction."""
     if catalog.relations is None:
         return
     strange = sorted(session.relations - catalog.relations)

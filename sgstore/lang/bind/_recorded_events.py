@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def happens(e: s.HappensExpression, names: SymbolTable) -> b.Happened:
-    """Return the bound form of ``HAPPENS``: a test for an event in the recording or in a user table.
+    """Return the resolved ``HAPPENS``: a test for an event in the recording or in a user table.
 
     Raises
     ------
@@ -47,7 +47,7 @@ def happens(e: s.HappensExpression, names: SymbolTable) -> b.Happened:
 
 
 def _no_event(e: s.HappensExpression) -> str | None:
-    """Return a hint for an unknown event name that is a predicate, relation or function; otherwise None."""
+    """If an unknown event name is a predicate, relation or function, return a hint; otherwise None."""
     word = normalize_name(e.kind)
     if word in predicates() or relation_named(e.kind) or word in map(normalize_name, FUNCTIONS):
         called = ", ".join(a.name if isinstance(a, s.Variable) else "a" for a in e.arguments)
@@ -59,7 +59,7 @@ def _no_event(e: s.HappensExpression) -> str | None:
 
 
 def _to_whom(e: s.HappensExpression, argument: s.Expression, names: SymbolTable) -> str:
-    """Return the key of the pattern node for an entity that an event involves."""
+    """Return the key of the pattern node that an argument of ``HAPPENS`` names."""
     found = names.bind(argument)
     if not isinstance(found, b.NodeValue):
         names.session.refuse(
@@ -81,7 +81,7 @@ _WHOM: Final = (("node_id", "other"), ("ident", "other_ident"), ("src", "dst"))
 
 
 def _columns_of(table: TableFacts, e: s.HappensExpression, names: SymbolTable) -> tuple[str, ...]:
-    """Return the columns of a user table that hold the entities of an event.
+    """Return the columns of a user table that have the entities of an event.
 
     Without entities, return one empty name.
     """

@@ -1,4 +1,4 @@
-"""Use of named patterns as steps, with renamed variables, as in ``MATCH cut_in(v = w)``.
+"""Named patterns as steps of a query, with new names for variables: ``MATCH cut_in(v = w)``.
 
 A renamed variable has its new name everywhere in the pattern. Other variables keep their names, so the same
 name is the same entity in every step.
@@ -24,7 +24,7 @@ _NAMED = (s.NodePattern, s.EdgePattern, s.StepClause, s.Variable)
 def values_given(
     step: s.ScenarioStep, parameters: Mapping[str, str], session: Session
 ) -> list[s.Argument]:
-    """Return the arguments of a step such as ``cut_in(gap = 5)`` that set parameters of the named pattern.
+    """Return the arguments of a step that set parameters of its named pattern: ``cut_in(gap = 5)``.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def own_names(
     taken: frozenset[str],
     session: Session,
 ) -> dict[str, str]:
-    """Return the new names for the variables of a named pattern that is used as a step: old name → new name.
+    """Return the new variable names for a step that is a named pattern: old name → new name.
 
     Variables bound in braces are invisible outside. If their name is already used, they get a name that
     queries cannot write.
@@ -111,7 +111,7 @@ def own_names(
 
 
 def _variables(steps: Sequence[s.StepClause]) -> Iterator[str]:
-    """Yield the names that steps define (nodes, edges, steps), then the variables that their conditions use."""
+    """Yield the names that steps define (nodes, edges, steps), then the variables in their conditions."""
     for step in steps:
         yield from (name for name in _bound(step.block) if name != THE_EGO)
         if step.name is not None:
@@ -127,7 +127,7 @@ def _bound(block: s.Block) -> list[str]:
 
 
 def _spoken_of(part: Any, own: tuple[str, ...]) -> Iterator[str]:
-    """Yield the variables in a part of a syntax tree, except nodes and edges of an enclosing ``EXISTS {…}``."""
+    """Yield the variables in part of a syntax tree, except those that an ``EXISTS {…}`` in it defines."""
     if isinstance(part, s.Variable):
         yield from () if part.name in own else (part.name,)
         return
@@ -141,7 +141,7 @@ def _spoken_of(part: Any, own: tuple[str, ...]) -> Iterator[str]:
 
 
 def names_written(sequence: s.SequenceClause) -> frozenset[str]:
-    """Return the names that a sequence of steps defines or uses."""
+    """Return all names that a sequence of steps defines or uses."""
     found: set[str] = set()
     for step in sequence.steps:
         if isinstance(step, s.GroupStep):
@@ -154,7 +154,7 @@ def names_written(sequence: s.SequenceClause) -> frozenset[str]:
 
 
 def names_of_group(group: s.GroupStep) -> frozenset[str]:
-    """Return the variables of a group of steps, without variables that have the label ``Ego``."""
+    """Return the variables of a group of steps, except those with the label ``Ego``."""
     egos = {
         node.name
         for step in _steps_in(group)
@@ -175,12 +175,12 @@ def _steps_in(group: s.GroupStep) -> Iterator[s.StepClause]:
 
 
 def names_returned(returns: s.Returns | None) -> frozenset[str]:
-    """Return the variables that a ``RETURN`` clause uses."""
+    """Return the names of the variables in a ``RETURN`` clause."""
     return frozenset(_spoken_of(returns, ())) if returns is not None else frozenset()
 
 
 def renamed(step: s.StepClause, names: Mapping[str, str]) -> s.StepClause:
-    """Return a copy of a sequence step with renamed variables."""
+    """Return a copy of a sequence step in which variables have new names."""
     return _renamed(step, names) if names else step
 
 

@@ -25,7 +25,7 @@ _FORMS: Final[dict[str, b.Form]] = {
 
 
 def bind_result(returns: s.Returns | None, names: SymbolTable) -> b.Result:
-    """Bind the clauses after ``RETURN``. ``None`` means no ``RETURN``."""
+    """Resolve ``RETURN`` and the clauses after it. Without ``RETURN``, return the default result."""
     if returns is None:
         return b.Result()
     inner = replace(names, aggregates=True, over=True)
@@ -58,7 +58,7 @@ def bind_result(returns: s.Returns | None, names: SymbolTable) -> b.Result:
 
 
 def _special(returns: s.Returns, session: Session) -> s.Item | None:
-    """Return the item ``FRAMES``, ``INTERVALS``, ``SUBGRAPHS`` or ``CLIPS`` of a ``RETURN`` clause, or None."""
+    """If a ``RETURN`` clause has ``FRAMES``, ``INTERVALS``, ``SUBGRAPHS`` or ``CLIPS``, return this item."""
     special = [item for item in returns.items if item.form not in {"value", "all"}]
     if len(special) > 1:
         session.refuse("write one of FRAMES, INTERVALS, SUBGRAPHS or CLIPS", special[1].span)
@@ -66,7 +66,7 @@ def _special(returns: s.Returns, session: Session) -> s.Item | None:
 
 
 def bind_columns(items: Iterable[s.Item], names: SymbolTable) -> tuple[b.ReturnColumn, ...]:
-    """Return the bound columns of a ``RETURN`` clause.
+    """Return the columns of a ``RETURN`` clause, with resolved names.
 
     An aggregate may use the grouping values of the same clause.
     """
@@ -88,7 +88,7 @@ def _group_keys(columns: Iterable[b.ReturnColumn]) -> dict[b.Bound, str]:
 
 
 def _of_groups(value: b.Bound, keys: Mapping[b.Bound, str]) -> b.Bound:
-    """Return an expression in which grouping values are replaced by references to their result columns."""
+    """Return an expression in which each grouping value refers to its result column."""
     if value in keys:
         return b.GroupKey(keys[value], value.type)
     if isinstance(value, b.Operation):
@@ -97,7 +97,7 @@ def _of_groups(value: b.Bound, keys: Mapping[b.Bound, str]) -> b.Bound:
 
 
 def bind_column(item: s.Item, names: SymbolTable) -> b.ReturnColumn:
-    """Bind one value to return. Lists are refused, except those of aggregates."""
+    """Resolve one value of a ``RETURN`` clause. Raise an error for a list that is not an aggregate."""
     assert item.value is not None  # noqa: S101 - the form of the item guarantees it
     value = settled(names.bind(item.value), names.session)
     if value.type is Type.list and not (isinstance(value, b.Aggregate) or b.is_passed_on(value)):
@@ -107,7 +107,7 @@ def bind_column(item: s.Item, names: SymbolTable) -> b.ReturnColumn:
 
 
 def _refuse_mixed(value: b.Bound, span: TextSpan, session: Session) -> None:
-    """Raise an error for an expression that mixes an aggregate with a value of a single match."""
+    """Raise an error if an expression uses an aggregate together with a value of a single match."""
     if b.is_counted(value) and _of_each(value):
         session.refuse(
             "a value of each match cannot be returned with a value of all matches",
@@ -117,7 +117,7 @@ def _refuse_mixed(value: b.Bound, span: TextSpan, session: Session) -> None:
 
 
 def _of_each(value: b.Bound, *, matches: bool = False) -> bool:
-    """True if an expression uses values of single matches outside an aggregate such as ``COUNT``.
+    """True if an expression uses a value of single matches outside aggregates such as ``COUNT``.
 
     ``matches``: values over a match are allowed.
     """
@@ -129,7 +129,7 @@ def _of_each(value: b.Bound, *, matches: bool = False) -> bool:
 
 
 def _having(written: s.Expression | None, result: b.Result, names: SymbolTable) -> b.Bound | None:
-    """Return the bound ``HAVING`` condition on groups of matches, matches or intervals, or None."""
+    """Return the ``HAVING`` condition with resolved names; None without ``HAVING``."""
     if written is None:
         return None
     session = names.session
@@ -166,7 +166,7 @@ def _having(written: s.Expression | None, result: b.Result, names: SymbolTable) 
 
 
 def _key(value: s.Expression, result: b.Result, names: SymbolTable) -> b.Bound | str:
-    """Return the bound key of a sort or sample: the name of a result column, or an expression on each match."""
+    """Return the key for sorting or sampling: a result column's name, or a resolved expression."""
     own = {column.name: column.value for column in result.columns}
     known = (*result.names, *own)
     taken = isinstance(value, s.Variable) and names.meaning(value.name) is not None
@@ -213,7 +213,7 @@ _TRACE_NAME: Final = b.TraceAttribute(TRACE_ATTRIBUTES["name"], Type.text)
 
 
 def _top(top: s.Sample | None, result: b.Result, names: SymbolTable) -> b.Sampling | None:
-    """Return the bound form of ``LIMIT n PER value``, which keeps the first n rows for each value; or None."""
+    """Return the resolved ``LIMIT n PER value`` (keep the first n rows of each value); None without it."""
     if top is None or top.per is None:
         return None
     per = _key(top.per, result, names)

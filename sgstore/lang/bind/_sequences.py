@@ -1,4 +1,4 @@
-"""Binder of sequences (steps and links of a ``MATCH``). Named scenarios are replaced by their steps.
+"""Binder of sequences (steps of a ``MATCH``, with links). Named scenarios are replaced by their steps.
 
 Each step has its own scope, about one frame. A node of several steps has the same key in all of them: it is
 the same entity.
@@ -42,7 +42,7 @@ SEQUENCES: Final = frozenset({"concept", "scenario"})
 
 @dataclass(slots=True)
 class StepScope(ScopeBuilder):
-    """Nodes and conditions of one sequence step during binding. The step can use nodes of other steps.
+    """Nodes and conditions of a sequence step while its names are resolved.
 
     Attributes
     ----------
@@ -53,16 +53,16 @@ class StepScope(ScopeBuilder):
     known: dict[str, b.Node] = field(default_factory=dict[str, b.Node])
 
     def mention(self, key: str) -> None:
-        """Record that the step uses a node. A node of another step is added to this step."""
+        """Record that the step uses a node, which may come from another step."""
         if key not in self.nodes and key in self.known:
             self.nodes[key] = self.known[key]
 
     def kinds(self, key: str) -> b.Kinds:
-        """Return the kinds that a node may have in this sequence step."""
+        """Return the kinds of node that a variable can match in this step."""
         return self.nodes[key].kinds if key in self.nodes else self.known[key].kinds
 
     def the_ego(self, span: TextSpan) -> str:
-        """Return the key of the ego node from any step of the sequence, or add an ego node to this step."""
+        """Return the key of the ego node of the sequence. If no step has it, add it to this step."""
         for node in (*self.nodes.values(), *self.known.values()):
             if not node.kinds.other:
                 self.mention(node.key)
@@ -72,7 +72,7 @@ class StepScope(ScopeBuilder):
 
 @dataclass(slots=True)
 class BoundSequence:
-    """Sequence of steps with their nodes and links, while the binder resolves it.
+    """Sequence of steps, with nodes and links, while its names are resolved.
 
     Attributes
     ----------
@@ -102,11 +102,11 @@ class BoundSequence:
     ways: list[b.StepWay] = field(default_factory=list[b.StepWay])
 
     def scope(self) -> ScopeBuilder:
-        """Return the nodes and edges that values of a match can use: named ones and the ego."""
+        """Return the nodes and edges that ``RETURN`` can use: those with names, and the ego."""
         return ScopeBuilder(self.session, nodes=self.ends | self.known, edges=list(self.edges))
 
     def take_in_ego(self, told: ScopeBuilder) -> None:
-        """Add the ego to the last required step of the sequence, if the query uses the ego outside all steps.
+        """If the query uses the ego, but no required step has it, add it to the last one.
 
         ``told`` is the scope of the values of a match.
         """
@@ -133,7 +133,7 @@ class BoundSequence:
 
 @dataclass(frozen=True, slots=True)
 class _Written:
-    """Step of a sequence as a syntax tree, with the parameter values of its scenario.
+    """Step of a sequence in the syntax tree, with the parameter values of its scenario.
 
     ``called`` is the place of the call, if the text of the scenario is in the library.
     """
@@ -146,13 +146,13 @@ class _Written:
 
 @dataclass(frozen=True, slots=True)
 class _WrittenSteps:
-    """Steps of a sequence as syntax trees, with the links between neighbouring steps."""
+    """Steps of a sequence in the syntax tree, with the links between neighbouring steps."""
 
     steps: list[_Written | _WrittenGroup]
     links: list[tuple[s.LinkClause, Mapping[str, Any] | None]]
 
     def changed(self, change: Callable[[_Written], _Written]) -> _WrittenSteps:
-        """Return a copy of the sequence in which a function is applied to every step."""
+        """Return a copy of the sequence in which each step is replaced by the result of a function."""
         return _WrittenSteps(
             [
                 change(one)
@@ -164,7 +164,7 @@ class _WrittenSteps:
         )
 
     def given(self, values: Mapping[str, Any]) -> _WrittenSteps:
-        """Return a copy of the sequence with parameter values added to steps and links.
+        """Return a copy of the sequence in which steps and links have additional parameter values.
 
         Existing values stay.
         """
@@ -180,7 +180,7 @@ class _WrittenSteps:
         return _WrittenSteps(steps, links)
 
     def flat(self) -> Iterator[_Written]:
-        """Yield every step of the sequence in reading order, including the steps of groups."""
+        """Yield all steps of the sequence in reading order, including those inside groups."""
         for one in self.steps:
             if isinstance(one, _Written):
                 yield one
@@ -191,7 +191,7 @@ class _WrittenSteps:
 
 @dataclass(frozen=True, slots=True)
 class _WrittenGroup:
-    """Group of alternative step sequences in brackets, with its number of repetitions.
+    """Group in brackets: alternative step sequences that repeat a number of times.
 
     ``fresh`` are the variables of the group alone. If there are some, each repetition has its own steps
     (``rounds``) and its own bindings of these variables.
@@ -203,7 +203,7 @@ class _WrittenGroup:
 
     @property
     def rounds(self) -> list[list[_WrittenSteps]]:
-        """Alternatives of a group, one list for each repetition with its own copy of the steps."""
+        """Alternatives of the group: one list per repetition if each has its own steps, else one list."""
         size = len(self.alternatives) // (self.group.high if self.fresh else 1)
         every = self.alternatives
         return [every[first : first + size] for first in range(0, len(every), size)]
@@ -215,7 +215,7 @@ def bind_sequence(
     bind_block: Callable[[s.Block, SymbolTable], None],
     returned: frozenset[str] = frozenset(),
 ) -> BoundSequence:
-    """Return the bound steps and links of a ``MATCH``, with names resolved and scenarios replaced by steps.
+    """Resolve the steps and links of a ``MATCH``. Named scenarios are replaced by their steps.
 
     Parameters
     ----------
@@ -258,7 +258,7 @@ MAX_WAYS: Final = 100
 def _ways(
     written: _WrittenSteps, before: list[_Way], span: TextSpan, session: Session
 ) -> list[_Way]:
-    """Return all sequences without groups that together equal a sequence with groups.
+    """Return all plain sequences that a sequence with groups can mean.
 
     Each one is appended to each of the given beginnings.
     """
@@ -279,7 +279,7 @@ def _ways(
 
 
 def _ways_on(written: _WrittenGroup, before: list[_Way], session: Session) -> list[_Way]:
-    """Return the given step sequences, extended by all repetitions and alternatives of a group."""
+    """Extend step sequences by a group: one result for each alternative and number of repetitions."""
     group, found = written.group, list[_Way]()
     again = s.LinkClause("then", None, None, group.span)
     open_ended, rounds = before, written.rounds
@@ -305,7 +305,7 @@ def _bind_steps(
     *,
     again: bool = False,
 ) -> None:
-    """Bind the steps of a sequence in reading order. ``again`` means that a group repeats them."""
+    """Resolve the steps of a sequence in reading order. ``again``: a group repeats these steps."""
     for one in written.steps:
         if isinstance(one, _Written):
             if again and one.step.name is not None:
@@ -323,7 +323,7 @@ def _bind_steps(
 
 
 def _forget(names: frozenset[str], found: BoundSequence) -> None:
-    """Remove the variables of a group, so that its next repetition can define them again."""
+    """Remove the variables of a group from the known names, so that a repetition can define them again."""
     symbols = {name: found.meanings.pop(name) for name in names & found.meanings.keys()}
     keys = {symbol.node or symbol.edge for symbol in symbols.values()}
     found.known = {key: node for key, node in found.known.items() if key not in keys}
@@ -338,7 +338,7 @@ def _bind_group(
     *,
     again: bool,
 ) -> None:
-    """Bind the alternatives of a group of steps.
+    """Resolve the alternatives of a group of steps.
 
     Later steps can use only names that all alternatives define.
     """
@@ -368,7 +368,7 @@ def _bind_group(
 
 
 def _either(nodes: list[b.Node]) -> b.Node:
-    """Return one node that allows the kinds of several nodes with the same name."""
+    """Return a node that allows every kind of several nodes with the same name."""
     kinds = nodes[0].kinds
     for node in nodes[1:]:
         kinds = kinds | node.kinds
@@ -378,7 +378,7 @@ def _either(nodes: list[b.Node]) -> b.Node:
 def _spelled_out(
     sequence: s.SequenceClause, session: Session, depth: int, outside: frozenset[str]
 ) -> _WrittenSteps:
-    """Return the steps and links of a sequence, with named scenarios replaced by their own steps.
+    """Return the steps and links of a sequence, in which steps replace each named scenario.
 
     ``outside`` are the variables that the query uses outside the sequence.
     """
@@ -432,7 +432,7 @@ def _with_own_names(
     taken: frozenset[str],
     session: Session,
 ) -> _WrittenSteps:
-    """Return the steps of a named pattern, with variables renamed by the arguments of the call."""
+    """Return the steps of a named pattern. Variables have the names that the call gives them."""
     names = own_names(step, [one.step for one in inner.flat()], parameters, taken, session)
     return inner.changed(lambda one: replace(one, step=renamed(one.step, names)))
 
@@ -449,7 +449,7 @@ def _parameters_shipped(step: s.ScenarioStep) -> dict[str, str]:
 
 
 def _shipped(step: s.ScenarioStep, session: Session) -> s.SequenceClause | None:
-    """Return the sequence of a pattern from the standard library.
+    """Return the steps of a pattern from the query library.
 
     ``None`` if the query defines the name or it is unknown.
     """
@@ -489,7 +489,7 @@ def _scenario(step: s.ScenarioStep, session: Session) -> s.Define:
 
 
 def _values(step: s.ScenarioStep, definition: s.Define, session: Session) -> dict[str, Any]:
-    """Return the parameter values of a scenario call: name → argument, or the default."""
+    """Return the parameter values of a scenario call: parameter name → argument or default value."""
     formals = {formal.name: formal for formal in definition.parameters}
     names = SymbolTable(session, ScopeBuilder(session))
     values: dict[str, Any] = {f.name: _value(f.default) for f in formals.values() if f.default}
@@ -519,7 +519,7 @@ def _value(value: s.Given) -> Any:
 def _check_absent(
     steps: list[_Written], links: list[tuple[s.LinkClause, Any]], session: Session
 ) -> None:
-    """Raise an error for a ``NOT MATCH`` step whose place or neighbouring links are not allowed."""
+    """Raise an error if ``NOT MATCH`` is at a wrong place of a sequence, or next to a wrong link."""
     for number, written in enumerate(steps):
         if not written.step.absent:
             continue
@@ -612,7 +612,7 @@ def _parameters(
     name: str = "",
     called: TextSpan | None = None,
 ) -> Generator[None]:
-    """Context manager that binds a scenario with its own parameter values, and names it in errors."""
+    """Context manager in which names of a scenario are resolved with its own parameter values."""
     outside = session.parameters, session.shipped
     session.shipped = called is not None
     if values is not None:

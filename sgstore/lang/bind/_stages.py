@@ -1,4 +1,4 @@
-"""Binder of queries in stages: ``OPTIONAL MATCH``, ``WITH``, later ``MATCH`` clauses or named paths.
+"""Binder of queries with several clauses: ``OPTIONAL MATCH``, ``WITH``, more ``MATCH``, named paths.
 
 All stages are about one frame. A stage can use the variables of earlier stages, as a block can use the
 variables around it. A variable that ``WITH`` does not pass on loses its name. Without grouping, it remains
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class StagedScope(ScopeBuilder):
-    """Nodes and edges of all clauses (``MATCH``, ``WITH``) of a query that are bound so far.
+    """Nodes and edges of all clauses (``MATCH``, ``WITH``) of a query that are resolved so far.
 
     The first pattern always binds the ego.
 
@@ -51,7 +51,7 @@ class StagedScope(ScopeBuilder):
     ego: str = ""
 
     def the_ego(self, span: TextSpan) -> str:
-        """Return the key of the ego node, which the first pattern of the query binds."""
+        """Return the key of the ego node. The first pattern of the query contains this node."""
         self.ego = self.first.the_ego(span)
         self.nodes.setdefault(self.ego, replace(self.first.nodes[self.ego], role="unnamed"))
         return self.ego
@@ -59,7 +59,7 @@ class StagedScope(ScopeBuilder):
 
 @dataclass(slots=True)
 class _Match:
-    """Bound ``MATCH`` clause of a query, with the variables of earlier clauses."""
+    """``MATCH`` clause with resolved names, and the variables of earlier clauses."""
 
     scope: ScopeBuilder
     paths: list[b.PathValue]
@@ -67,7 +67,7 @@ class _Match:
     optional: bool = field(kw_only=True)
 
     def finished(self, ego: b.Node | None) -> b.MatchStage:
-        """Return the stage for the query, with the pairs of new and earlier nodes that must differ."""
+        """Return the finished clause, with the pairs of its nodes and earlier nodes that must differ."""
         earlier = self.earlier | ({} if ego is None else {ego.key: ego})
         apart = tuple(
             (key, other)
@@ -80,20 +80,20 @@ class _Match:
 
 
 def _may_be_same(one: b.Kinds, other: b.Kinds) -> bool:
-    """True if two variables can match the same node. The result is False if both must be the ego."""
+    """True if two variables can match the same node. If both must be the ego, the result is False."""
     return bool(one.other & other.other or (one.ego & other.ego and (one.other or other.other)))
 
 
 @dataclass(slots=True)
 class _With:
-    """Bound ``WITH`` clause of a query, with the nodes before and after it."""
+    """``WITH`` clause with resolved names, and the nodes before and after it."""
 
     stage: b.WithStage
     before: dict[str, b.Node]
     after: dict[str, b.Node]
 
     def finished(self, ego: b.Node | None) -> b.WithStage:
-        """Return the final ``WITH`` stage. It passes the ego on if a later clause uses it."""
+        """Return the finished ``WITH`` clause. It keeps the ego if a later clause uses it."""
         stage = self.stage
         if ego is not None:
             self.before.setdefault(ego.key, ego)
@@ -177,7 +177,7 @@ class StageBinder:
             )
 
     def _checked(self, value: b.Bound) -> b.Bound:
-        """Return an expression unchanged, or raise an error if it is not allowed in a query with stages.
+        """Return an expression. Raise an error if a query with several clauses cannot use it.
 
         Temporal operators, and ``WITH`` values in braces, are not allowed.
         """
@@ -247,7 +247,7 @@ class StageBinder:
     def _passed(
         self, clause: s.WithClause, names: SymbolTable
     ) -> tuple[dict[str, Symbol], tuple[b.ReturnColumn, ...], tuple[b.FrameAttribute, ...]]:
-        """Return the names known after a ``WITH`` clause, its computed values, and their placeholders."""
+        """Return the names known after a ``WITH`` clause, its computed values, and placeholders for them."""
         symbols: dict[str, Symbol] = {}
         written: list[s.Item] = []
         for item in clause.items:
@@ -275,7 +275,7 @@ class StageBinder:
     def _named(
         self, item: s.Item, names: SymbolTable, written: list[s.Item]
     ) -> Mapping[str, Symbol]:
-        """Return the name and symbol that a ``WITH`` item passes on. Unbound items are added to ``written``."""
+        """Return the name that a ``WITH`` item passes on, and its meaning. Add other items to ``written``."""
         value = item.value
         if isinstance(value, s.Variable):
             symbol = names.meaning(value.name)
@@ -292,7 +292,7 @@ class StageBinder:
     def _renamed(
         self, symbols: dict[str, Symbol]
     ) -> tuple[tuple[tuple[str, str], ...], tuple[tuple[b.Edge, str], ...]]:
-        """Give unique keys to the passed nodes and edges. Return pairs: new key, old key.
+        """Give a unique key to each passed node and edge. Return pairs of new and old key.
 
         ``symbols`` is updated.
         """
@@ -319,7 +319,7 @@ class StageBinder:
     # The whole
 
     def result(self, result: b.Result) -> b.Result:
-        """Return the result of the query. Whole matches get extra columns for the values passed by ``WITH``."""
+        """Return the result of the query. A result with whole matches also has the values of ``WITH``."""
         for value in result.values:
             self._checked(value)
         if not result.whole:
@@ -333,11 +333,11 @@ class StageBinder:
         return replace(result, columns=(*more, *result.columns))
 
     def scope(self) -> b.Scope:
-        """Return all nodes and edges that are bound after the last clause of the query."""
+        """Return all nodes and edges that a variable names after the last clause of the query."""
         return _bare(self._told.nodes, self._told.edges)
 
     def stages(self) -> tuple[b.Stage, ...]:
-        """Return all bound clauses of the query. Call this last, because every clause may introduce the ego."""
+        """Return all clauses with resolved names. Any of them may add the ego, so call this last."""
         told = self._told
         ego = told.first.nodes.get(told.ego)
         ego = ego and replace(ego, role="unnamed")
@@ -355,7 +355,7 @@ MOST_WAYS: Final = 100
 
 
 def _place(name: str, value: b.Bound | None, session: Session) -> b.FrameAttribute:
-    """Return a new placeholder for a value that ``WITH`` passes on. ``value=None`` means a path."""
+    """Return a placeholder for a value that ``WITH`` passes on, or for a path if the value is missing."""
     session.numbers += 1
     if value is None or b.is_path(value):
         return b.passed_on(f"{b.PASSED}{name} p{session.numbers}", Type.list)
@@ -372,7 +372,7 @@ def _place(name: str, value: b.Bound | None, session: Session) -> b.FrameAttribu
 
 
 def name_path(path: s.Path, nodes: list[str], edges: list[str], names: SymbolTable) -> None:
-    """Define the name of a path, as in ``p = (a)-[:near]->(b)``. Its value is the list of its nodes.
+    """Define the name of a path, such as ``p`` in ``p = (a)-[:near]->(b)``. It means the list of its nodes.
 
     Raises
     ------
@@ -395,12 +395,12 @@ def name_path(path: s.Path, nodes: list[str], edges: list[str], names: SymbolTab
 
 
 def _bare(nodes: Mapping[str, b.Node], edges: Iterable[b.Edge]) -> b.Scope:
-    """Return a pattern of nodes and edges that has no conditions."""
+    """Return a pattern with the given nodes and edges, without conditions."""
     return b.Scope(nodes, {}, tuple(edges), (), frozenset())
 
 
 def _in_blocks(values: Iterable[b.Bound]) -> Iterable[b.Bound]:
-    """Yield all subexpressions inside patterns in braces, such as ``EXISTS {…}``, of some expressions."""
+    """Yield all subexpressions inside the patterns in braces, such as ``EXISTS {…}``, of expressions."""
     for value in values:
         for block in b.blocks_of(value):
             for inner in block.inside:

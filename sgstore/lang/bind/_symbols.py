@@ -1,4 +1,4 @@
-"""Symbol table of the query language: the names that a query can use at a place, and their meanings.
+"""Symbol table of the query language: the names known at a place of the query, and their meanings.
 
 There are two chains from the inside out. *Names*: a block can use the names around it, the body of a
 predicate can use only its parameters. *Scopes* hold nodes: a node used in an inner scope becomes an outer
@@ -48,7 +48,7 @@ RESERVED: Final = frozenset({"env", "frame", "trace"})
 
 @dataclass(frozen=True, slots=True)
 class Symbol:
-    """Meaning of a name: a node, an edge, or a value (for a predicate parameter)."""
+    """Meaning of a name in a query: a node, an edge, or a value."""
 
     node: str | None = None
     edge: str | None = None
@@ -63,7 +63,7 @@ Binders = Mapping[type, Binder]
 
 @dataclass(slots=True)
 class Session:
-    """State that all parts of a query share while the binder resolves its names.
+    """Shared state while the names of a query are resolved.
 
     Attributes
     ----------
@@ -153,7 +153,7 @@ class Session:
     shipped: bool = False
 
     def ask(self, catalog: Catalog) -> None:
-        """Copy the facts that name resolution needs from a catalog of the store."""
+        """Copy the known names (attributes, tables, traces) from the catalog of a store."""
         self.classed, self.tables, self.traces = catalog.classed, catalog.tables, catalog.traces
         self.own = {**RECORDED_OWN, **catalog.own}
         self.own_edges, self.part = catalog.own_edges, catalog.part
@@ -162,12 +162,12 @@ class Session:
         self.strict = not (catalog.part or others or any(one.reach is None for one in self.traces))
 
     def look_beyond(self, catalog: Catalog, *, world: bool) -> None:
-        """Load the pair settings of the traces, if the statement uses entities outside the scene graphs."""
+        """Load the pair settings of all traces if the statement uses entities outside the scene graphs."""
         if world and (catalog.world or catalog.online):
             self.beyond = scopes_of(self.traces)
 
     def key(self, name: str | None) -> str:
-        """Return an unused key for a node or edge: its name if possible, or ``#1``, ``#2``, … if unnamed."""
+        """Return an unused key for a node or edge: its name if possible; ``#1``, ``#2``, … without a name."""
         self.numbers += name is None
         wanted = name or f"#{self.numbers}"
         key, copy = wanted, 2
@@ -177,17 +177,17 @@ class Session:
         return key
 
     def refuse(self, reason: str, span: TextSpan, hint: str | None = None) -> NoReturn:
-        """Raise a :class:`QueryError` that marks a part of the query text."""
+        """Raise a :class:`QueryError` that marks the faulty part of the query text."""
         raise QueryError(reason, text=self.text, span=span, hint=hint)
 
     def impossible(self, reason: str, span: TextSpan, hint: str) -> None:
-        """Raise an error for a part that no recording has. Inside a predicate, only add a note."""
+        """Raise an error for a part that no recording can match. In a predicate, only add a note."""
         if self.strict and not self.calls and not self.shipped:
             self.refuse(reason, span, hint)
         self.doubt(f"{reason}; {hint}")
 
     def doubt(self, note: str) -> None:
-        """Add a note about a part of the query, except inside definitions of the standard library."""
+        """Add a note about a part of the query, unless it comes from the query library."""
         written = (self.predicates[normalize_name(name)] for name in self.calls)
         library = predicates() if self.calls else {}
         shipped = any(library.get(normalize_name(one.name)) is one for one in written)
@@ -204,7 +204,7 @@ class Session:
 
 @dataclass(slots=True)
 class ScopeBuilder:
-    """Nodes, edges and conditions of a pattern, while the binder collects them."""
+    """Nodes, edges and conditions of a pattern while its names are resolved."""
 
     session: Session
     parent: ScopeBuilder | None = None
@@ -215,22 +215,22 @@ class ScopeBuilder:
 
     @property
     def top(self) -> ScopeBuilder:
-        """Outermost scope: the nodes and edges of the ``MATCH`` that encloses a pattern in braces."""
+        """Outermost pattern: that of the ``MATCH`` around a pattern in braces."""
         return self.parent.top if self.parent else self
 
     def kinds(self, key: str) -> Kinds:
-        """Return the kinds that a pattern node may have in this scope."""
+        """Return the kinds of node that a variable can match in this pattern."""
         return self.nodes[key].kinds if key in self.nodes else self.outer[key]
 
     def mention(self, key: str) -> None:
-        """Record that this pattern uses a node, which may belong to an enclosing pattern."""
+        """Record that this pattern uses a node, which may come from the pattern around it."""
         if key in self.nodes or key in self.outer or self.parent is None:
             return
         self.parent.mention(key)
         self.outer[key] = self.parent.kinds(key)
 
     def narrow(self, key: str, kinds: Kinds) -> None:
-        """Restrict a pattern node to some kinds of node, in this pattern only."""
+        """Restrict a node to some kinds within this pattern only."""
         if key in self.outer:
             self.outer[key] = self.outer[key] & kinds
         else:
@@ -244,19 +244,19 @@ class ScopeBuilder:
         return key
 
     def the_ego(self, span: TextSpan) -> str:
-        """Return the key of the ego node of the pattern, and add a missing ego node."""
+        """Return the key of the ego node of the pattern. If the pattern has none, add it."""
         for node in self.nodes.values():
             if not node.kinds.other:
                 return node.key
         return self.add(THE_EGO, ego_kinds(), span, named=False)
 
     def finished(self) -> Scope:
-        """Return the finished pattern, with the pairs of its nodes that must differ."""
+        """Return the finished pattern, which has the pairs of its nodes that must differ."""
         where = tuple(self.where)
         return Scope(self.nodes, self.outer, tuple(self.edges), where, self.distinct())
 
     def distinct(self) -> frozenset[tuple[str, str]]:
-        """Return the pairs of nodes that must differ, including pairs with nodes of outer patterns."""
+        """Return the pairs of nodes that must differ, here or with nodes of outer patterns."""
         if not self.session.injective:
             return frozenset()
         pairs = {*combinations(self.nodes, 2), *product(self.nodes, self.outer)}
@@ -272,7 +272,7 @@ class ScopeBuilder:
 
 @dataclass(slots=True)
 class SymbolTable:
-    """Names that a part of a query can use, with the pattern that it belongs to.
+    """Names that a part of a query can use, and the pattern to which this part belongs.
 
     Attributes
     ----------
@@ -304,18 +304,18 @@ class SymbolTable:
     aliases: Mapping[str, Bound] = field(default_factory=dict[str, "Bound"])
 
     def block(self) -> SymbolTable:
-        """Return the symbol table of a nested pattern in braces."""
+        """Return the symbol table of a pattern in braces inside this part."""
         return SymbolTable(self.session, ScopeBuilder(self.session, self.scope), parent=self)
 
     def body(self, meanings: dict[str, Symbol]) -> SymbolTable:
-        """Return the symbol table for the body of a predicate called at this place.
+        """Return the symbol table for the body of a predicate that this part of the query calls.
 
         The body sees only the given names.
         """
         return SymbolTable(self.session, self.scope, meanings)
 
     def meaning(self, name: str) -> Symbol | None:
-        """Return the meaning of a name in a query, or None if unknown.
+        """Return the meaning of a name in a query, or None for an unknown name.
 
         The name ``ego`` is not resolved here.
         """
@@ -327,7 +327,7 @@ class SymbolTable:
         return None
 
     def node(self, name: str, span: TextSpan) -> str:
-        """Return the key of the pattern node with a name, and record that the pattern uses it.
+        """Return the key of the pattern node with this name, and record that the pattern uses it.
 
         Raises
         ------
@@ -353,7 +353,7 @@ class SymbolTable:
         return key
 
     def _hint(self, name: str) -> str | None:
-        """Return a hint for a name that is unknown at this place of the query, or None."""
+        """Return a hint for a name that is not known at this place of the query, or None."""
         if self.session.calls:
             return f"{self.session.calls[-1]}() can use only its parameters and ego"
         if name in self.session.dropped:
@@ -362,7 +362,7 @@ class SymbolTable:
         return variable_hint(name, self.visible(), elsewhere) or call_hint(name)
 
     def bind(self, expression: s.Expression) -> Bound:
-        """Return the bound form of an expression of any type: names resolved, value type known.
+        """Resolve the names and types of an expression of any type.
 
         Raises
         ------
@@ -374,7 +374,7 @@ class SymbolTable:
         return self.session.binders[type(expression)](expression, self)
 
     def condition(self, expression: s.Expression) -> Bound:
-        """Return the bound form of an expression that must be a condition (true, false or unknown).
+        """Resolve the names and types of an expression that must be a condition (true, false or unknown).
 
         Raises
         ------
@@ -392,7 +392,7 @@ class SymbolTable:
         return found
 
     def number(self, expression: s.Expression) -> Bound:
-        """Return the bound form of an expression that must be a number.
+        """Resolve the names and types of an expression that must be a number.
 
         Raises
         ------
@@ -410,13 +410,13 @@ class SymbolTable:
         return found
 
     def visible(self) -> set[str]:
-        """Return all variable names usable at this place of a query, without ``frame``, ``trace``, ``env``."""
+        """Return the variable names that this place can use, except ``frame``, ``trace`` and ``env``."""
         outside = self.parent.visible() if self.parent else {THE_EGO}
         return outside | set(self.meanings) | set(self.aliases)
 
 
 def of_type(value: Bound, kind: Type) -> Bound:
-    """Set the type of a value whose topic type is unknown to the given type. Return other values unchanged."""
+    """If a value of a topic has an unknown type, return it with the given type; otherwise unchanged."""
     if value.type is not Type.open or kind in {Type.open, Type.null}:
         return value
     if isinstance(value, FrameAttribute):
@@ -427,7 +427,7 @@ def of_type(value: Bound, kind: Type) -> Bound:
 
 
 def call_hint(name: str) -> str | None:
-    """Return a hint with the signature of a predicate or function of two entities, or None for another name."""
+    """If a name is a predicate or a function of two entities, return a hint with its signature."""
     word = normalize_name(name)
     if (found := predicates().get(word)) is not None:
         formals = ", ".join(formal.name for formal in found.parameters)

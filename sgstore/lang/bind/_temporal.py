@@ -32,7 +32,7 @@ _LENGTH: Final = re.compile(r"(\d+(?:\.\d+)?)\s*(ms|s|min|frames)", re.IGNORECAS
 
 
 def tense(e: s.Temporal, names: SymbolTable) -> b.Tense:
-    """Return the bound form of a temporal operator such as ``EVENTUALLY``.
+    """Resolve a temporal operator such as ``EVENTUALLY``.
 
     Raises
     ------
@@ -57,7 +57,7 @@ def tense(e: s.Temporal, names: SymbolTable) -> b.Tense:
 
 
 def length(e: s.Duration | s.Parameter, names: SymbolTable) -> b.Length:
-    """Return the bound form of a duration. A parameter value is a number of seconds, or text such as ``2s``.
+    """Resolve a duration. A parameter value is a number of seconds, or text such as ``2s``.
 
     Raises
     ------
@@ -92,14 +92,14 @@ def _given(e: s.Parameter, names: SymbolTable) -> tuple[float, str]:
 
 
 def timespan(e: s.Duration, _: SymbolTable) -> b.Value:
-    """Return the bound constant of a duration: a number of seconds, or of frames."""
+    """Return a duration as a constant: a number of seconds, or of frames."""
     if e.unit == "frames":
         return b.Value(e.amount, Type.number, unit="frames", span=e.span)
     return b.Value(e.ns / 1e9, Type.number, unit="s", span=e.span)
 
 
 def course(e: s.Call, names: SymbolTable) -> b.Bound:
-    """Return the bound call of a function over time: ``prev(x)``, ``delta(x, 2s)``, ``run_length(p)``, ….
+    """Resolve a call of a function over time: ``prev(x)``, ``delta(x, 2s)``, ``run_length(p)``, ….
 
     Raises
     ------
@@ -133,7 +133,7 @@ def _delta(e: s.Call, names: SymbolTable) -> b.SignalCall:
 
 
 def _how_far(e: s.Call, names: SymbolTable) -> b.Length:
-    """Return the bound duration in a call such as ``delta(x, 2s)``."""
+    """Check and return the duration argument of a call such as ``delta(x, 2s)``."""
     back = e.arguments[1]
     if not isinstance(back, s.Duration | s.Parameter):
         names.session.refuse("expected a duration such as 2s", back.span)
@@ -141,7 +141,7 @@ def _how_far(e: s.Call, names: SymbolTable) -> b.Length:
 
 
 def _window(e: s.Call, names: SymbolTable) -> b.SignalCall:
-    """Return the bound call of a function over a time window that ends at the current frame."""
+    """Resolve a call of a function over a time window that ends at the current frame."""
     word = _WINDOWS[normalize_name(e.name)]
     value = names.number(e.arguments[0])
     _refuse_nested(e, value, names)
@@ -169,7 +169,7 @@ def _window(e: s.Call, names: SymbolTable) -> b.SignalCall:
 
 
 def refuse_window(e: s.FrameWindow, names: SymbolTable) -> b.Bound:
-    """Raise an error for a time window that is not an argument of a function over time."""
+    """Raise an error for a time window outside the arguments of a function over time."""
     names.session.refuse(
         "-1s..1s is a window of min_over, max_over, avg_over or sum_over",
         e.span,
@@ -178,7 +178,7 @@ def refuse_window(e: s.FrameWindow, names: SymbolTable) -> b.Bound:
 
 
 def refuse_ahead(found: b.Bound, span: TextSpan, names: SymbolTable) -> None:
-    """Raise an error for a window with later frames in a ``CHECK``, whose windows must end at the frame."""
+    """Raise an error if a window in a ``CHECK`` contains later frames. It must end at the frame."""
     if any(isinstance(part, b.SignalCall) and part.ahead for part in b.walk(found)):
         names.session.refuse(
             "a window of a CHECK ends at the frame",
@@ -268,7 +268,7 @@ def _refuse_nested(e: s.Call, value: b.Bound, names: SymbolTable) -> None:
 
 
 def settled(expression: b.Bound, session: Session) -> b.Bound:
-    """Return an expression in which run lengths have the unit of the compared value: frames or time.
+    """Return an expression in which each run length has the unit of the compared value: frames or s.
 
     A run is a series of frames in which a condition holds.
 
@@ -298,7 +298,7 @@ def _settled(expression: b.Bound) -> b.Bound:
 
 
 def _compared(parts: tuple[b.Bound, ...]) -> tuple[b.Bound, ...]:
-    """Return the sides of a comparison, with ``run_length`` in the unit of the other side: frames or time."""
+    """Return both sides of a comparison. A ``run_length`` gets the unit of the other side."""
     inside = [part for side in parts for part in b.walk(side)]
     if not any(isinstance(p, b.SignalCall) and p.word in _RUNS for p in inside):
         return parts
@@ -323,7 +323,7 @@ def _counting(expression: b.Bound, frames: bool | None) -> b.Bound:  # noqa: FBT
 
 
 def _lengths(expression: b.Bound) -> Iterator[b.Value]:
-    """Yield the constants of an expression, also those of its patterns in braces."""
+    """Yield the constants in an expression and in its patterns in braces."""
     for part in b.walk(expression):
         match part:
             case b.Value():

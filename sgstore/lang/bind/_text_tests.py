@@ -18,7 +18,7 @@ _NOT_RE2: Final = re.compile(r"\(\?(?!:|P<\w+>|[ims]+[:)])|\\[1-9NuUZ]|[*+?}]\+"
 
 
 def text_test(e: s.Comparison, left: b.Bound, right: b.Bound, names: SymbolTable) -> b.Operation:
-    """Return the bound comparison of two texts, such as ``CONTAINS`` or ``=~``.
+    """Resolve a comparison of two texts, such as ``CONTAINS`` or ``=~``.
 
     Raises
     ------

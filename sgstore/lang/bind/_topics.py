@@ -25,7 +25,7 @@ _TIME: Final = re.compile(r"(\d+(?:\.\d+)?)(ms|s|min)?", re.IGNORECASE)
 
 
 def topic_field(e: s.TopicExpression, names: SymbolTable) -> b.FrameAttribute:
-    """Return the bound value of a field of a topic at the frame.
+    """Resolve a reference to a field of a topic: its value at the frame.
 
     Raises
     ------
@@ -60,7 +60,7 @@ def topic_field(e: s.TopicExpression, names: SymbolTable) -> b.FrameAttribute:
 def _of_recordings(
     topic: str, path: str, e: s.TopicExpression, session: Session
 ) -> tuple[str, str, Type]:
-    """Return the names of the topic and of the field as the recordings spell them, and the type."""
+    """Return the topic name and the field name in the spelling of the recordings, and the type."""
     from sgstore.lang.topics import TopicError, field_of, topic_of  # imports numpy
 
     try:
@@ -96,7 +96,7 @@ def _refuse(error: TopicError, span: TextSpan, session: Session) -> NoReturn:
 
 
 def tolerance_of(value: str, span: TextSpan, session: Session) -> int | None:
-    """Return the time of ``USING TOLERANCE``; ns. ``None`` means unlimited."""
+    """Return the time in ``USING TOLERANCE``; ns. None for ``INF``, which means no limit."""
     if value.upper() == "INF":
         return None
     found = _TIME.fullmatch(value)

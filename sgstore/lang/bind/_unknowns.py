@@ -1,4 +1,4 @@
-"""Conditions under which a value in a frame is unknown (not recorded), although its entities are present.
+"""Conditions that are true if a value of a frame is unknown: its entities exist, but it was not recorded.
 
 A value is *unknown* if a measured quantity (a speed, a size, the weather) was not recorded, or if a relation
 was not computed because an entity is beyond the graph. A value that does not exist is not unknown: two
@@ -70,7 +70,7 @@ _LOOSE: Final = 1 << 20
 
 
 def unknown(value: b.Bound) -> b.Bound | None:
-    """Return the condition that an expression is unknown in a frame. ``None`` means that it is always known.
+    """Return a condition: true if the value of an expression is unknown in a frame. None if it never is.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def unknown(value: b.Bound) -> b.Bound | None:
 
 
 def has_pairs(value: b.Bound) -> bool:
-    """True if an expression uses a number of two entities, such as ``ttc(a, b)``. Some pairs do not have it."""
+    """True if an expression uses a number of two entities, such as ``ttc(a, b)``, which may not exist."""
     match value:
         case b.PairNumber():
             return True
@@ -93,7 +93,7 @@ def has_pairs(value: b.Bound) -> bool:
 
 
 def negated(condition: b.Bound) -> b.Bound:  # noqa: PLR0911 - a case each
-    """Return the negation of a condition, with ``NOT`` moved inside every ``AND`` and ``OR``."""
+    """Return the negation of a condition. ``NOT`` is moved inside every ``AND`` and ``OR``."""
     match condition:
         case b.Operation("NOT", (operand,)):
             return pushed(operand)
@@ -115,7 +115,7 @@ def negated(condition: b.Bound) -> b.Bound:  # noqa: PLR0911 - a case each
 
 
 def pushed(condition: b.Bound) -> b.Bound:
-    """Return an equivalent condition, with ``NOT`` moved inside every ``AND`` and ``OR``."""
+    """Return an equivalent condition in which ``NOT`` is inside every ``AND`` and ``OR``."""
     match condition:
         case b.Operation("NOT", (operand,)):
             return negated(operand)
@@ -144,7 +144,7 @@ def spelled_out(operands: tuple[b.Bound, ...]) -> b.Bound:
 def certain(  # noqa: PLR0911 - a case each
     condition: b.Bound, *, decided: bool = False
 ) -> b.Bound:
-    """Return a stronger condition: true if the given condition is true for all possible values of unknowns.
+    """Return a condition that is true if the given one is true whatever the unknown values are.
 
     A comparison without a value is false. If it compares pair numbers, its negation is false too.
 
@@ -179,7 +179,7 @@ def certain(  # noqa: PLR0911 - a case each
 
 
 def possible(condition: b.Bound) -> b.Bound:
-    """Return a weaker condition: true if the given condition is true for some possible values of unknowns."""
+    """Return a condition that is true if the given one is true for some possible unknown values."""
     match condition:
         case b.Operation("AND" | "OR", operands):
             return replace(condition, operands=tuple(map(possible, operands)))
@@ -196,7 +196,7 @@ def possible(condition: b.Bound) -> b.Bound:
 
 
 def undecided(condition: b.Bound) -> b.Bound | None:
-    """Return the condition that another condition is possible, but not certain.
+    """Return a condition that is true if the given one is possible, but not certain.
 
     ``None`` means that it is always known.
 
@@ -258,7 +258,7 @@ def _unknown(value: b.Bound) -> Iterable[b.Bound]:  # noqa: C901, PLR0912 - a ca
 
 
 def by_lanes(value: b.Bound) -> bool:
-    """True if an expression in online mode depends on the driven lanes in junctions."""
+    """True if an expression of the online mode depends on the lanes that vehicles choose in junctions."""
     match value:
         case b.NodeAttribute(attribute=attribute, online=True):
             return attribute.unit is DisplayUnit.role
@@ -276,7 +276,7 @@ def by_lanes(value: b.Bound) -> bool:
 
 
 def _later(value: b.NodeAttribute | b.FrameAttribute | b.EdgeAttribute | b.PairNumber) -> b.Bound:
-    """Return the condition that a value depends on a lane that only later frames decide."""
+    """Return a condition: true if a value depends on a lane that is known only after later frames."""
     match value:
         case b.EdgeAttribute(edge=edge):
             return b.EdgeAttribute(edge, UNSURE_LANE, Type.boolean)
@@ -296,7 +296,7 @@ def _frame(attribute: Attribute) -> b.Bound:
 
 
 def without_guesses(query: b.Query) -> b.Query:
-    """Return a query of the online mode without matches that depend on an undecided driven lane."""
+    """Return a query of the online mode that skips matches which depend on a lane not known yet."""
 
     def sure(condition: b.Bound) -> b.Bound:
         if not by_lanes(condition):
@@ -328,7 +328,7 @@ def _attribute(node: str, name: str) -> b.Bound:
 
 
 def _unmeasured(node: str, name: str, value: b.Bound) -> b.Bound:
-    """Return the condition that a measured attribute of a node, such as its speed, was not recorded."""
+    """Return a condition: true if a measured attribute of a node, such as its speed, was not recorded."""
     if name not in MOTION:
         return _is_null(value)
     still = b.Operation("coalesce", (_attribute(node, "is_static"), _FALSE), Type.boolean)
@@ -337,7 +337,7 @@ def _unmeasured(node: str, name: str, value: b.Bound) -> b.Bound:
 
 @lru_cache(maxsize=1024)
 def _of_block(block: b.BlockValue) -> tuple[b.Bound, ...]:
-    """Return conditions that are true if a match of a pattern in braces may depend on unknown values.
+    """Return conditions that are true if a pattern in braces has a match that depends on unknown values.
 
     The result is cached.
     """
@@ -354,7 +354,7 @@ def _of_block(block: b.BlockValue) -> tuple[b.Bound, ...]:
 
 
 def _of_apart(block: b.BlockValue) -> b.Bound | None:
-    """Return the condition that a pattern in braces may match with an edge that was not computed, or None."""
+    """Return a condition: true if ``{…}`` may match with an edge that was not computed; None if never."""
     apart = {edge.key: one for edge in block.scope.edges if (one := _not_computed(edge, block))}
     if not apart:
         return None
@@ -367,7 +367,7 @@ def _of_apart(block: b.BlockValue) -> b.Bound | None:
 
 @lru_cache(maxsize=1024)
 def _sure(block: b.BlockValue) -> b.BlockValue:
-    """Return a copy of ``EXISTS {…}`` or ``COUNT {…}`` that counts only certain matches."""
+    """Return a copy of ``EXISTS {…}`` or ``COUNT {…}`` that counts only matches without unknown values."""
     doubted = any(_of_blocks(one) and unknown(one) is not None for one in block.scope.where)
     loose = [
         b.inverse(b.any_of(doubts))
@@ -386,7 +386,7 @@ def _sure(block: b.BlockValue) -> b.BlockValue:
 def _exists(
     block: b.BlockValue, edges: tuple[b.Edge, ...], where: tuple[b.Bound, ...], number: int
 ) -> b.Bound:
-    """Return an ``EXISTS {…}`` like the given pattern in braces, but with other edges and conditions."""
+    """Return an ``EXISTS {…}`` made from a pattern in braces, but with the given edges and conditions."""
     asked = frozenset().union(*({edge.src, edge.dst} for edge in edges), *map(b.nodes_of, where))
     nodes = {key: node for key, node in block.scope.nodes.items() if key in asked}
     if not nodes and not edges:
@@ -410,7 +410,7 @@ def _exists(
 
 
 def _counted(condition: b.Bound) -> tuple[list[b.BlockValue], str, b.Value] | None:
-    """Split a comparison such as ``COUNT {…} > 2`` into its patterns, operator and number, or return None."""
+    """Split a comparison such as ``COUNT {…} > 2`` into patterns, operator and number; None for others."""
     match condition:
         case b.Operation(word, (counts, b.Value(value=int() | float()) as limit)):
             pass
@@ -435,7 +435,7 @@ def _summands(value: b.Bound) -> list[b.BlockValue]:
 
 
 def _of_counts(condition: b.Operation, *, least: bool) -> b.Bound:
-    """Return the condition that a comparison such as ``COUNT {…} > 2`` is certain (``least``) or possible."""
+    """Return a condition: true if ``COUNT {…} > 2`` is certainly true (``least``), or possibly true."""
     found = _counted(condition)
     assert found is not None  # noqa: S101 - it was asked before
     blocks, word, limit = found
@@ -457,7 +457,7 @@ def _of_counts(condition: b.Operation, *, least: bool) -> b.Bound:
 
 
 def _can_be_counted(block: b.BlockValue) -> bool:
-    """True if the possible matches of a pattern in braces can be counted from its nodes alone."""
+    """True if the possible matches of a pattern in braces can be counted by its nodes alone."""
     beyond = _of_apart(block)
     told = not any(edge.named for edge in block.scope.edges)
     return beyond is None or (told and isinstance(beyond, b.BlockValue))
@@ -472,7 +472,7 @@ def _total(blocks: Iterable[b.BlockValue]) -> b.Bound:
 
 
 def _all_of(block: b.BlockValue) -> Iterable[b.BlockValue]:
-    """Yield patterns in braces that together cover every possible match of a pattern in braces."""
+    """Yield patterns in braces whose matches together are all possible matches of the given pattern."""
     where = tuple(possible(pushed(part)) for part in block.scope.where)
     scope = replace(block.scope, where=where)
     yield replace(block, scope=scope, number=block.number + 8 * _LOOSE)
@@ -487,16 +487,13 @@ def _edges_of(condition: b.Bound) -> frozenset[str]:
 
 
 def _not_computed(edge: b.Edge, block: b.BlockValue) -> b.Bound | None:
-    """Return the condition that an edge of a pattern in braces was not computed, or None.
-
-    ``None`` means that it is always known.
-    """
+    """Return a condition that is true if an edge inside ``{…}`` was not computed; None if never."""
     found = [*_beyond(edge, block.scope), *_unmeasured_ends(edge, block.scope), *_unsure(edge)]
     return b.any_of(found) if found else None
 
 
 def _unsure(edge: b.Edge) -> Iterable[b.Bound]:
-    """Yield the condition that an edge depends on a driven lane that later frames decide."""
+    """Yield conditions that are true if an edge depends on a driven lane that later frames decide."""
     if not _leads(edge):
         return
     if edge.high > 1:
@@ -509,7 +506,7 @@ def _unsure(edge: b.Edge) -> Iterable[b.Bound]:
 
 
 def _beyond(edge: b.Edge, scope: b.Scope) -> Iterable[b.Bound]:
-    """Yield the condition that an edge is not computed because a node is outside the scene graph.
+    """Yield a condition that is true if an edge was not computed, as a node is outside the scene graph.
 
     A relation does not hold between entities that the settings do not relate. A distance relation does not
     hold beyond its distance.
@@ -532,7 +529,7 @@ def _related(edge: b.Edge, reach: RelationScope | None) -> b.Bound:
 
 
 def _unmeasured_ends(edge: b.Edge, scope: b.Scope) -> Iterable[b.Bound]:
-    """Yield the conditions that an edge may be missing because a measurement of a node is missing."""
+    """Yield conditions that are true if an edge may be missing because a measured value is missing."""
     for forward in (True, False) if edge.both else (True,):
         for end, key in enumerate((edge.src, edge.dst) if forward else (edge.dst, edge.src)):
             every = scope.kinds(key).every

@@ -1,4 +1,4 @@
-"""Distance relations between entities outside the scene graph of a frame, computed from positions.
+"""Distance relations of entities outside the scene graph of a frame, computed from their positions.
 
 A graph has edges between its own entities only. The distance relations of ``[proximity]`` and ``overlaps``
 are defined by positions and sizes, which are also known beyond the graph. In scope ``world`` a block with
@@ -33,7 +33,7 @@ _SIDES: Final = 10.0
 
 
 def beyond_graph(edge: b.Edge) -> b.Bound:
-    """Return the condition that the nodes of an edge differ, and are not both in the frame's scene graph."""
+    """Return a condition that is true if the nodes of an edge differ and are not both in the graph."""
     keys = edge.src, edge.dst
     two = b.Operation("<>", tuple(map(b.NodeValue, keys)), Type.boolean)
     ends = (b.NodeAttribute(key, IN_GRAPH, Type.boolean) for key in keys)
@@ -41,7 +41,7 @@ def beyond_graph(edge: b.Edge) -> b.Bound:
 
 
 def whole_block(block: b.BlockValue, number: int) -> b.Bound:
-    """Return an expression for a pattern in braces that also includes entities outside the scene graph.
+    """Return an expression that extends a pattern in braces to entities outside the scene graph.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def whole_block(block: b.BlockValue, number: int) -> b.Bound:
 
 
 def _is_told(edge: b.Edge, block: b.BlockValue) -> bool:
-    """True if the relation of an edge can be computed from distances, for entities outside the scene graph."""
+    """True if distances suffice to compute the relation of an edge outside the scene graph."""
     if edge.high > 1 or edge.named or not edge.beyond:
         return False
     kinds = [block.scope.kinds(key) for key in (edge.src, edge.dst)]
@@ -83,7 +83,7 @@ def _is_told(edge: b.Edge, block: b.BlockValue) -> bool:
 
 
 def bounded_in(scopes: b.Scopes) -> frozenset[str]:
-    """Return the names of relations that have a distance limit, from the settings of some traces."""
+    """Return the names of the relations that have a distance limit in the settings of some traces."""
     rungs = (name for reach, _ in scopes if reach is not None for name, _ in reach.rungs)
     return frozenset({"overlaps", *PROXIMITY, *rungs}) - frozenset(DIRECTIONS)
 
@@ -94,10 +94,7 @@ def _reach(edge: b.Edge, reach: RelationScope) -> float:
 
 
 def _defined(block: b.BlockValue, edges: tuple[b.Edge, ...], number: int) -> b.BlockValue:
-    """Return a copy of a pattern in braces with some edges replaced by their geometric definition.
-
-    Some edges become conditions on distances.
-    """
+    """Return a copy of a pattern in braces in which conditions on distances replace some edges."""
     told = {edge.key for edge in edges}
     where = [*block.scope.where]
     for edge in edges:
@@ -107,7 +104,7 @@ def _defined(block: b.BlockValue, edges: tuple[b.Edge, ...], number: int) -> b.B
 
 
 def looks_less(check: b.BoundCheck, ego: b.Node) -> b.BoundCheck:
-    """Return a copy of a check that ignores all entities farther from the ego than the range of the check.
+    """Return a copy of a check that uses only entities within the range of the check around the ego.
 
     Parameters
     ----------
@@ -133,7 +130,7 @@ def looks_less(check: b.BoundCheck, ego: b.Node) -> b.BoundCheck:
 
 
 def _limited(value: b.Bound, ego: b.Node, limit: float) -> b.Bound:
-    """Return an expression whose patterns in braces match only entities within a distance of the ego."""
+    """Return an expression whose patterns in braces match only entities near the ego, within a distance."""
     again = partial(_limited, ego=ego, limit=limit)
     if not isinstance(value, b.BlockValue):
         return b.with_operands(value, again)
@@ -148,12 +145,12 @@ def _limited(value: b.Bound, ego: b.Node, limit: float) -> b.Bound:
 
 
 def is_limited(node: b.Node) -> bool:
-    """True if a node may be an entity other than the ego, to which a distance limit applies."""
+    """True if a node can be an entity other than the ego, so that the distance limit applies to it."""
     return bool(node.kinds.other & entity_kinds())
 
 
 def within(key: str, ego: str, limit: float) -> b.Bound:
-    """Return the condition that the footprint of a node is within a distance of the ego's centre.
+    """Return a condition: true if the footprint of a node is within a distance of the ego's centre.
 
     A node without a position, and a part of the map, count as near.
     """
@@ -175,7 +172,7 @@ def within(key: str, ego: str, limit: float) -> b.Bound:
 
 
 def holds(edge: b.Edge, names: Iterable[str]) -> b.Bound:
-    """Return the condition that the nodes of an edge meet the definition of one of the named relations.
+    """Return a condition: true if the nodes of an edge meet the definition of one of the given relations.
 
     For a trace with unknown settings: the condition that the edge may have one of them.
     """

@@ -1,1 +1,1 @@
-"""Translators that convert query languages of other tools to the query language of sgstore."""
+"""Translators from query languages of other tools to the query language of sgstore."""

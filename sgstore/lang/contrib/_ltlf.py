@@ -1,4 +1,4 @@
-"""Translator of LTLf formulas (temporal logic on finite traces), in the syntax of ``ltlf2dfa``."""
+"""Translator of LTLf formulas (temporal logic on finite traces), as ``ltlf2dfa`` writes them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _WORDS: Final = {"->": "IMPLIES", "|": "OR", "&": "AND", "U": "UNTIL", "R": "REL
 
 
 class LtlFormula:
-    """Translator of temporal logic formulas (LTLf) in the syntax of ``ltlf2dfa``.
+    """Translator of temporal logic formulas (LTLf), as ``ltlf2dfa`` writes them.
 
     ``$[N][…]`` means N frames in a row.
     """
@@ -100,7 +100,7 @@ class LtlFormula:
         return f"({inner})"
 
     def _in_a_row(self, times: int, inner: str) -> str:
-        """Return the query condition that a formula is true in N consecutive frames at some time."""
+        """Return a condition: true if a formula is true in N consecutive frames at some time."""
         if not 0 < times <= MAX_TIMES:
             raise self._refused(f"expected 1 to {MAX_TIMES} frames")
         last = times - 1

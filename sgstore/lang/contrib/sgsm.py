@@ -1,4 +1,4 @@
-"""Translator from SGSM properties, written in the Scene Graph Language (SGL), to the query language.
+"""Translator of SGSM properties in the Scene Graph Language (SGL) to the query language.
 
 The input is Python code for SGSM, with nested calls or nested ``partial``. It is parsed, but never run::
 
@@ -80,7 +80,7 @@ _SIGNS: Final[dict[type[ast.cmpop], str]] = {
 
 
 def translated(text: str) -> str:
-    """Return the text of SGSM properties as text of the query language.
+    """Translate the text of SGSM properties to the query language.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ def _place(text: str, error: SyntaxError) -> TextSpan:
 
 @dataclass
 class _Found:
-    """Set of scene graph nodes as a query pattern. ``node`` is the variable for a member of the set."""
+    """Set of scene graph nodes, written as a pattern. ``node`` is the variable for its members."""
 
     node: str
     label: str = ""
@@ -145,7 +145,7 @@ class _Found:
     where: list[str] = field(default_factory=list[str])
 
     def text(self) -> str:
-        """Return a set of nodes as query text: the paths and conditions inside ``EXISTS {…}``."""
+        """Return the text of the pattern: the paths and conditions inside ``EXISTS {…}``."""
         paths = self.paths or [f"({self.node}{self.label})"]
         return ", ".join(paths) + (f" WHERE {' AND '.join(self.where)}" if self.where else "")
 
@@ -216,7 +216,7 @@ class _Translation:
     # Truth values and numbers
 
     def truth(self, value: ast.expr) -> str:
-        """Return a truth value of an SGL formula as text of a query condition."""
+        """Translate an SGL formula with a truth value to a query condition."""
         word, arguments = self._call(value)
         if word in _COMPARISONS:
             return self._comparison(_COMPARISONS[word], *arguments)
@@ -253,7 +253,7 @@ class _Translation:
         return f"COUNT {{({member}) WHERE {self._member(arguments[0], member)}}}"
 
     def _written(self, value: ast.expr, at: ast.expr) -> str:
-        """Return a number of an SGL formula as text of the query language."""
+        """Translate an SGL formula whose value is a number to the query language."""
         number = value.value if isinstance(value, ast.Constant) else None
         if isinstance(number, bool) or not isinstance(number, int | float):
             raise self._refused("expected a number", at)
@@ -264,7 +264,7 @@ class _Translation:
     # Sets of nodes
 
     def _set(self, value: ast.expr, node: str = "") -> _Found:
-        """Return a set of nodes in an SGL formula as a query pattern.
+        """Translate an SGL formula whose value is a set of nodes to a pattern.
 
         ``node`` is the variable name for its members.
         """
@@ -329,7 +329,7 @@ class _Translation:
         return f"{_ATTRIBUTES[name].format(node)} {sign} {self._number(compared.comparators[0])}"
 
     def _resembling(self, node: str, name: str, test: ast.Constant) -> str:
-        """Return a regular expression of an SGL formula as a query condition on the matching values."""
+        """Translate a regular expression of an SGL formula to a condition that lists the matching values."""
         try:
             wanted = regex(str(test.value))
         except re.error as error:
@@ -378,7 +378,7 @@ class _Translation:
         )
 
     def _member(self, of: ast.expr, node: str) -> str:
-        """Return the query condition that a node is in a set of an SGL formula."""
+        """Return a condition: true if a node is in a set of an SGL formula."""
         found = self._set(of, node)
         if found.paths:
             return f"EXISTS {{{found.text()}}}"
@@ -392,7 +392,7 @@ class _Translation:
         return f"n{self._numbers}"
 
     def _resolved(self, value: ast.expr) -> ast.expr:
-        """Return the expression that a variable name in the SGL text is assigned to."""
+        """Return the expression that the SGL text assigns to a name. Other expressions stay unchanged."""
         for _ in range(MAX_NAMES):
             if not isinstance(value, ast.Name) or value.id not in self._names:
                 return value
@@ -431,7 +431,7 @@ class _Translation:
         return QueryError(reason, text=self._text, span=TextSpan(start, max(end, start + 1)))
 
     def _offset(self, line: int, column: int) -> int:
-        """Convert a position in Python source, line and byte, to an offset in the text."""
+        """Convert a position in Python source (line, byte) to an index in the text."""
         lines = _LINE.findall(self._text)  # only line ends that Python accepts
         text = lines[line - 1] if line <= len(lines) else ""
         inside = text.encode(errors="replace")[:column].decode(errors="replace")

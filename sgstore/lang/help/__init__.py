@@ -1,4 +1,4 @@
-"""Help for users of the query language: reasons for failed matches, notes on a query, words for completion."""
+"""Help for users of the query language: reasons for failed matches, notes, words to complete a text."""
 
 from sgstore.lang.help._completion import words
 from sgstore.lang.help._notes import (

@@ -1,4 +1,4 @@
-"""Words of the query language for completion, each with its meaning."""
+"""Words that complete a query while the user types it, each with its meaning."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def words(catalog: Catalog) -> dict[str, Any]:
-    """Return the words of queries, with meanings: labels, relations, attributes, functions, topics, keywords.
+    """Return all words of the query language: labels, relations, attributes, functions, keywords.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def words(catalog: Catalog) -> dict[str, Any]:
 
 
 def _fields(topic: TopicFacts) -> list[dict[str, str]]:
-    """Return the fields of a topic as a query writes them. An unreadable topic has none."""
+    """Return the fields of a topic as a query writes them; none if the topic cannot be read."""
     from sgstore.lang.topics import fields_of  # imports numpy
 
     with suppress(SgstoreError):

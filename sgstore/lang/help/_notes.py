@@ -1,4 +1,4 @@
-"""Notes about likely mistakes in a query: compared texts and scenes that occur nowhere in the store.
+"""Notes on likely mistakes in a query: texts that no stored value equals, parts that no frame has.
 
 A misspelt name finds nothing, without an error. So the notes list the texts that are not values in the store,
 each with the nearest value. The compiler finds the comparisons. The caller looks the texts up in the store.
@@ -50,7 +50,7 @@ Compared = tuple[str, str]
 
 
 def compared_in_query(query: b.Query) -> list[Compared]:
-    """Return the comparisons of attributes with texts in a query, without duplicates."""
+    """Return each comparison of an attribute with a text in a query once."""
     returned = [column.value for column in query.result.columns]
     found = list(_comparisons(returned, query.scope))
     for scope in () if query.steps else query.patterns:
@@ -64,7 +64,7 @@ def compared_in_query(query: b.Query) -> list[Compared]:
 
 
 def compared_in_check(check: BoundCheck) -> list[Compared]:
-    """Return the comparisons of attributes with texts in a check, without duplicates."""
+    """Return each comparison of an attribute with a text in a check once."""
     values = [check.formula, *(one.where for one in check.quantifiers if one.where is not None)]
     values += [check.reset] if check.reset is not None else []
     return list(dict.fromkeys(_comparisons([*values, *check.scope.where], check.scope)))
@@ -110,7 +110,7 @@ def _type_of(kinds: b.Kinds) -> str:
 def notes_on(
     compared: Iterable[Compared], query: str, parameters: Mapping[str, object], ask: Ask
 ) -> tuple[str, ...]:
-    """Return notes about likely mistakes: texts in a query that no attribute value of the store equals.
+    """Return a note on each text in a query that equals no value of the attribute in the store.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def _note(name: str, text: str, ask: Ask) -> str:
 
 
 def _all_values(name: str) -> str:
-    """Return SQL that selects all values of an attribute in the store."""
+    """Return SQL that selects the different values of an attribute in the store."""
     places = (
         Select([f'{column} AS "value"'], [table], [f"({column}) IS NOT NULL", *where])
         for column, table, *where in _TEXTS_OF[name]
@@ -158,7 +158,7 @@ def _all_values(name: str) -> str:
 
 
 def absent_part(query: b.Query, exists: Callable[[b.Scope], bool]) -> tuple[str, ...]:
-    """Return a note on the first part of a query that no frame of the store has, or nothing.
+    """If no frame of the store has some part of a query, return a note on the first such part.
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ def absent_part(query: b.Query, exists: Callable[[b.Scope], bool]) -> tuple[str,
 def _first_absent(
     query: b.Query, exists: Callable[[b.Scope], bool], calls: b.Calls
 ) -> Iterator[tuple[b.Node | b.Edge | b.Bound, b.Scope, Writer, list[str]]]:
-    """Yield the first part that no frame has, the pattern up to it, a text writer, and the earlier parts.
+    """Yield the first part that no frame has, the pattern up to this part, a writer, and the earlier parts.
 
     The calls of predicates in ``calls`` are one part each.
     """
@@ -210,7 +210,7 @@ def _first_absent(
 def nearest_query(
     query: b.Query, exists: Callable[[b.Scope], bool]
 ) -> tuple[str, list[str], str, str] | None:
-    """Return a query for the frame that comes closest to the first pattern part that no frame has.
+    """Return a query for the frame that is nearest to a match of the first part that no frame has.
 
     Parameters
     ----------
@@ -241,7 +241,7 @@ def nearest_query(
 
 
 def _nearest(part: b.Node | b.Edge | b.Bound, scope: b.Scope, writer: Writer) -> tuple[str, str]:
-    """Return the value that the last part of a pattern compares, and a query for the nearest frame to it."""
+    """Return the value that a pattern's last part compares, and a query for the nearest frame."""
     value, limit, others = "", "", replace(scope, where=scope.where[:-1])
     match part:
         case b.Node():
@@ -263,7 +263,7 @@ def _nearest(part: b.Node | b.Edge | b.Bound, scope: b.Scope, writer: Writer) ->
 
 
 def _is_scene(condition: b.Bound) -> bool:
-    """True if a condition describes the presence of a scene; False for an absence, an id or a text test."""
+    """True if a condition requires something in the scene. Absences, ids and texts do not count."""
     match condition:
         case b.Operation(operands=(b.NodeAttribute(attribute=one), _)) if one.name == "id":
             return False
@@ -278,7 +278,7 @@ def _is_scene(condition: b.Bound) -> bool:
 
 
 def _alone(part: b.Node | b.Edge | b.Bound, scope: b.Scope) -> b.Scope:
-    """Return the pattern of one part: the nodes and edges that it uses, and nothing else."""
+    """Return a pattern with only one part of a given pattern, and the nodes and edges that it uses."""
     edges = [part] if isinstance(part, b.Edge) else []
     if isinstance(part, b.Node):
         keys = {part.key}
@@ -296,7 +296,7 @@ def _alone(part: b.Node | b.Edge | b.Bound, scope: b.Scope) -> b.Scope:
 
 
 def unknown_in_or(query: b.Query, ask: Ask) -> tuple[str, ...]:
-    """Return notes on attributes in ``OR`` without any known value. There, unknown counts as false."""
+    """Return a note on each attribute in an ``OR`` that has no known value. Unknown counts as false there."""
     conditions = [one for scope in query.patterns for one in scope.where]
     either = [part for one in conditions for part in b.walk(one) if _is_or(part)]
     used = [leaf for part in either for leaf in b.walk(part) if isinstance(leaf, b.NodeAttribute)]

@@ -1,4 +1,4 @@
-"""Splitting of a graph pattern into independent parts, each a query. Some nodes may be fixed.
+"""Splitting of a graph pattern into independent parts. Each part becomes a query.
 
 The split follows from logic: "there is an x such that A and B" can be split if only one of A and B uses x.
 Given nodes are constants, so conditions on given nodes are separate parts. Conditions and edges that share a
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class DrawnEdge:
-    """Pattern edge for a drawing: keys of its two nodes, label, and True if undirected."""
+    """Pattern edge for a drawing: its two nodes, its label, and True if it is undirected."""
 
     src: str
     dst: str
@@ -34,7 +34,7 @@ class DrawnEdge:
 
 @dataclass(frozen=True, slots=True)
 class PatternPart:
-    """Part of a graph pattern that shares no free variable with the other parts.
+    """Part of a graph pattern. It shares no variable with other parts, except nodes that are fixed.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ _Atom = b.Edge | b.Node | b.Bound
 
 
 def parts_of(query: b.Query, given: Mapping[str, Collection[int]]) -> Iterator[PatternPart]:
-    """Yield the independent parts of a query's graph patterns, step by step. ``given`` fixes some nodes to ids.
+    """Yield the independent parts of a query's patterns, step by step. ``given`` fixes nodes to ids.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def parts_of(query: b.Query, given: Mapping[str, Collection[int]]) -> Iterator[P
 
 
 def separable(query: b.Query, names: Iterable[str]) -> bool:
-    """True if no other node of the patterns must differ from the nodes with these names."""
+    """True if no other node of the patterns must differ from the named nodes."""
     keys = {key for key in _keys_of(query).values() if key.lower() in {n.lower() for n in names}}
     scopes = [query.first, *(step.scope for step in query.steps)]
     pairs = (
@@ -109,7 +109,7 @@ def separable(query: b.Query, names: Iterable[str]) -> bool:
 
 
 def has_nodes(query: b.Query, names: Iterable[str]) -> bool:
-    """True if the pattern of a query has nodes with all the given names."""
+    """True if the pattern of a query has a node for each given name."""
     return {name.lower() for name in names} <= _keys_of(query).keys()
 
 
@@ -188,7 +188,7 @@ def _written(condition: b.Bound, writer: Writer) -> str:
 
 
 def _call_of(conditions: Sequence[b.Bound], scope: b.Scope, calls: b.Calls) -> str:
-    """Return the predicate call whose definition contains all these conditions and more; empty without one."""
+    """Return the predicate call whose definition has all these conditions and more; else an empty text."""
     for call, text in calls.items():
         parts = b.conjuncts(call)
         inside = len(parts) > len(conditions) and all(one in parts for one in conditions)
@@ -206,7 +206,7 @@ def _label(edge: b.Edge) -> str:
 def _groups(
     scope: b.Scope, when: tuple[b.Bound, ...], pins: Mapping[str, Collection[int]]
 ) -> Iterator[list[_Atom]]:
-    """Yield groups of atoms (nodes, edges, conditions) that share free variables, in reading order.
+    """Yield groups of nodes, edges and conditions that share variables, in reading order.
 
     A variable is free if its node is not fixed.
     """
@@ -237,7 +237,7 @@ def _groups(
 
 
 def _ties(atom: _Atom, pins: Mapping[str, Collection[int]], asked: set[str]) -> set[str]:
-    """Return the free variables of an atom (node, edge or condition): nodes not fixed, and named edges."""
+    """Return the variables of a node, edge or condition: nodes that are not fixed, and named edges."""
     ties = {f"node {key}" for key in _nodes(atom) if key not in pins}
     if isinstance(atom, b.Edge):
         return ties | ({f"edge {atom.key}"} if atom.named or atom.key in asked else set())
@@ -247,7 +247,7 @@ def _ties(atom: _Atom, pins: Mapping[str, Collection[int]], asked: set[str]) -> 
 
 
 def _apart(scope: b.Scope, pins: Mapping[str, Collection[int]]) -> Iterator[tuple[str, str]]:
-    """Yield the pairs of pattern nodes that must differ, if neither is fixed and both allow a common kind."""
+    """Yield the pairs of nodes that must differ. Neither is fixed, and both can be of the same kind."""
     for one, other in scope.distinct:
         if one not in pins and other not in pins and (scope.kinds(one) & scope.kinds(other)):
             yield one, other
@@ -264,7 +264,7 @@ def _nodes(atom: _Atom) -> frozenset[str]:
 
 
 def _spoken_of(atoms: Iterable[_Atom], scope: b.Scope) -> list[str]:
-    """Return the keys of the nodes that some atoms (nodes, edges, conditions) use, in pattern order.
+    """Return the keys of the nodes that some nodes, edges and conditions use, in pattern order.
 
     Without such nodes, return one key.
     """
@@ -281,7 +281,7 @@ def _narrowed(
     pins: Mapping[str, Collection[int]],
     when: tuple[b.Bound, ...],
 ) -> b.Scope:
-    """Return a smaller graph pattern with only some atoms (nodes, edges, conditions).
+    """Return a pattern with only the given nodes, edges and conditions.
 
     Given nodes are fixed to their ids.
     """
@@ -309,7 +309,7 @@ _ID: Final = NODE_ATTRIBUTES["id"]
 
 
 def _relations(edges: list[b.Edge], conditions: list[b.Bound]) -> frozenset[str]:
-    """Return the names of all relations in some edges, and in the patterns in braces of some conditions."""
+    """Return the names of all relations of some edges, and of the edges in braces in some conditions."""
     found = frozenset[str]().union(*(edge.relations for edge in edges))
     for condition in conditions:
         for block in b.blocks_of(condition):

@@ -1,4 +1,4 @@
-"""Query text of a graph pattern, which users can paste into a query.
+"""Writer of graph patterns as query text that users can copy into a query.
 
 Nodes and edges without a name get one if the text needs it: ``lane`` for a lane, ``lane2`` for the second.
 """
@@ -24,12 +24,12 @@ _ESCAPES: Final = {"\\": "\\\\", "'": "\\'", "\n": "\\n", "\t": "\\t", "\r": "\\
 
 
 def text_written(text: str) -> str:
-    """Return a text constant in quotes with escapes, as a query writes it."""
+    """Return a text constant in quotes and with escapes, as in a query."""
     return "'" + "".join(_ESCAPES.get(letter, letter) for letter in text) + "'"
 
 
 def label_written(kinds: b.Kinds) -> str:
-    """Return the label, such as ``Car|Truck``, for a set of node kinds.
+    """Return the label for a set of node kinds, such as ``Car|Truck``.
 
     It is empty if all kinds are allowed.
     """
@@ -49,7 +49,7 @@ def label_written(kinds: b.Kinds) -> str:
 
 
 def kind_label(kind: str) -> str:
-    """Return the label, such as ``Car``, for a single kind of node."""
+    """Return the label for one kind of node, such as ``Car``."""
     return _label(frozenset({kind}))
 
 
@@ -75,7 +75,7 @@ def _camel(name: str) -> str:
 
 
 class Writer:
-    """Writer of a graph pattern as query text. It gives names to unnamed nodes.
+    """Writer of a graph pattern as query text. Nodes without a name get one.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ class Writer:
             self._names[key] = key if "~" not in key else self._free(key.split("~")[0])
 
     def expanded(self) -> Writer:
-        """Return a writer with the same names that writes the meaning of predicates."""
+        """Return a writer with the same names. It writes the definition of a predicate, not the call."""
         other = copy(self)
         other.calls = {}
         return other
@@ -112,7 +112,7 @@ class Writer:
         return name
 
     def name(self, key: str, kinds: b.Kinds | None = None) -> str:
-        """Return the variable name of a node or edge in the query text, or create an unused one."""
+        """Return the name of a node or edge in the query text. Without a name, it gets an unused one."""
         if key not in self._names:
             every = kinds.every if kinds else frozenset[str]()
             self._names[key] = self._free(next(iter(every)) if len(every) == 1 else "any")
@@ -126,12 +126,12 @@ class Writer:
         return f"({self.name(key, kinds)}{':' if label else ''}{label})"
 
     def edge(self, edge: b.Edge, scope: b.Scope) -> str:
-        """Return a pattern edge as query text, such as ``(e)-[:isIn]->(lane)``, without labels of its nodes."""
+        """Return a pattern edge as query text, such as ``(e)-[:isIn]->(lane)``. Its nodes have no labels."""
         ends = (f"({self.name(key, scope.kinds(key))})" for key in (edge.src, edge.dst))
         return self._arrow(edge).join(ends)
 
     def labelled_edge(self, edge: b.Edge, scope: b.Scope) -> str:
-        """Return a pattern edge as query text, with the labels of its nodes."""
+        """Return a pattern edge as query text. Its nodes have labels."""
         ends = (self.node(key, scope.kinds(key)) for key in (edge.src, edge.dst))
         return self._arrow(edge).join(ends)
 
@@ -143,7 +143,7 @@ class Writer:
         return f"-[{name}{label or (':%' if times else '')}{times}]{'-' if edge.both else '->'}"
 
     def edge_name(self, key: str) -> str:
-        """Return the variable name of an edge in the query text, or create an unused one."""
+        """Return the name of an edge in the query text. Without a name, it gets an unused one."""
         if key not in self._names:
             self._names[key] = self._free("edge")
         return self._names[key]
@@ -230,7 +230,7 @@ class Writer:
 
 
 def joined_calls(where: Sequence[b.Bound], calls: b.Calls) -> Iterator[b.Bound]:
-    """Yield the conditions of a pattern, with the conditions of one predicate call joined again."""
+    """Yield the conditions of a pattern. Those that come from one predicate call are joined again."""
     joined = {parts: call for call in calls if len(parts := tuple(b.conjuncts(call))) > 1}
     at = 0
     while at < len(where):
@@ -246,7 +246,7 @@ def pattern_text(scope: b.Scope) -> str:
 
 
 def in_words(value: b.Bound) -> b.Bound:
-    """Return an expression with the text of the query in place of each pattern in braces.
+    """Return an expression in which the query's text replaces each pattern in braces.
 
     In scope ``world``, several patterns stand for one of the query.
     """

@@ -1,4 +1,4 @@
-"""Explanation of a failed match: the first part of a pattern that a scene graph does not contain.
+"""Explanation why a pattern does not match: its first part that a scene graph does not contain.
 
 The parts of a pattern are tested in reading order: its nodes, each edge as soon as both its ends are bound,
 then the conditions. So the result names one part, and the parts before it hold together.
@@ -33,7 +33,7 @@ _WRITTEN_NUMBER: Final = re.compile(
 
 
 def _beyond(sign: str, limit: float, value: float) -> float:
-    """Return a limit with few digits that makes a comparison (sign, limit) true for a value."""
+    """Return a round limit, with few digits, at which a false comparison becomes true for a value."""
     if sign == "=":
         return value
     up = sign in {"<", "<="}
@@ -51,7 +51,7 @@ MOST_LOOKED_AT: Final = 10_000
 
 @dataclass(frozen=True, slots=True)
 class WhyNot:
-    """Explanation of a failed match: the longest part of a pattern that matches in a scene graph.
+    """Explanation why a pattern does not match a scene graph: the parts that match, and the first other part.
 
     Attributes
     ----------
@@ -79,7 +79,7 @@ class WhyNot:
     gaps: tuple[tuple[str, float, float], ...] = ()
 
     def relaxed(self, text: str) -> Iterator[tuple[int, int, str]]:
-        """Yield replacements for numbers in the query text that could make the failed condition true.
+        """Yield changes of numbers in the query text that could make the false condition true.
 
         Each result is the start, the end and the new text. A number may occur several times in the query, so
         the caller must test each replacement.
@@ -101,7 +101,7 @@ class WhyNot:
                         yield start, found.end(1), f"{new:.12g}"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the explanation as a dictionary of plain values."""
+        """Return the explanation as a dictionary of texts and numbers."""
         return {
             "matches": not self.failed,
             "held": list(self.held),
@@ -125,7 +125,7 @@ class WhyNot:
 
 @dataclass(frozen=True, slots=True)
 class WhyNotSteps:
-    """Explanation of a failed sequence: for each step, the longest part that matches in one scene graph.
+    """Explanation why a sequence does not match: for each step, the parts that match in a scene graph.
 
     Durations and order are ignored.
 
@@ -141,7 +141,7 @@ class WhyNotSteps:
     steps: tuple[WhyNot, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the explanation of all steps as a dictionary of plain values."""
+        """Return the explanation of all steps as a dictionary of texts and numbers."""
         pairs = zip(self.texts, self.steps, strict=True)
         return {"steps": [{"step": text, **step.as_dict()} for text, step in pairs]}
 
@@ -156,7 +156,7 @@ class WhyNotSteps:
 
 
 def why_not(query: b.Query, view: FrameView, text: str = "") -> WhyNot | WhyNotSteps:
-    """Return an explanation of how much of a query's pattern matches in a scene graph.
+    """Return an explanation why a query does not match a scene graph: the parts that match, and the rest.
 
     For a sequence, it explains each step.
     """
@@ -180,7 +180,7 @@ def _in_frame(asked: b.Scope, query: b.Query, view: FrameView) -> WhyNot:
 
 
 def looked_up(query: b.Query) -> list[b.FrameAttribute]:
-    """Return the frame attributes of a query that are not in the scene graph: weather and user tables."""
+    """Return the frame attributes that a query uses and a scene graph lacks: weather, user tables."""
     found: dict[str, b.FrameAttribute] = {}
 
     def look(scope: b.Scope) -> None:
@@ -197,7 +197,7 @@ def looked_up(query: b.Query) -> list[b.FrameAttribute]:
 
 
 def events_in(query: b.Query, frame_id: int, ask: Ask) -> dict[str, list[NodePair]]:
-    """Return the recorded events of a frame that a query uses: event kind → pairs of involved nodes.
+    """Return the recorded events in a frame that a query uses: event kind → pairs of entities.
 
     Parameters
     ----------
@@ -264,7 +264,7 @@ def _parts(scope: b.Scope, calls: b.Calls) -> list[_Part]:
 
 
 def growing(whole: b.Scope, calls: b.Calls) -> Iterator[tuple[b.Node | b.Edge | b.Bound, b.Scope]]:
-    """Yield each part of a pattern (node, edge or condition), with the pattern up to and including it."""
+    """Yield each part of a pattern (node, edge or condition), and the pattern from the start up to it."""
     scope = _nothing(whole)
     for part in _parts(whole, calls):
         if isinstance(part, b.Node):
@@ -317,7 +317,7 @@ def _failure(
 
 
 def _gaps(condition: b.Bound, at: Binding, query: b.Query) -> Iterator[tuple[str, float, float]]:
-    """Yield the comparisons with a number that are false in a condition: sign, limit and actual value."""
+    """Yield the false comparisons in a condition: comparison sign, limit and actual value of each."""
     for part in b.walk(condition):
         match part:
             case b.Operation(word=word, operands=(left, right)) if word in _COMPARED:
@@ -334,7 +334,7 @@ def _gaps(condition: b.Bound, at: Binding, query: b.Query) -> Iterator[tuple[str
 
 
 def _constant_of(value: b.Bound) -> float | None:
-    """Return the value of a numeric constant in an expression; None for other expressions."""
+    """If an expression is a number, return its value; otherwise None."""
     match value:
         case b.Value(shown=int() | float() as number) if not isinstance(number, bool):
             return float(number)
@@ -345,7 +345,7 @@ def _constant_of(value: b.Bound) -> float | None:
 
 
 def shortfall(condition: b.Bound, at: Binding, query: b.Query) -> float:
-    """Return how far the values in a match are from making a condition true; 0 means true, inf unknown."""
+    """Return how far a condition is from being true for a match: 0 if it is true, inf if unknown."""
     if _value(condition, at, query) is True:
         return 0.0
     match condition:
@@ -369,20 +369,20 @@ def _value(of: b.Bound, at: Binding, query: b.Query) -> Any:
 
 
 def _apart(edge: b.Edge, at: Binding) -> float:
-    """Return the distance between the two nodes of an edge in m, or inf if unknown."""
+    """Return the distance of the two nodes of an edge; m; inf if unknown."""
     distance = at.view.pair("dist", at.nodes[edge.src], at.nodes[edge.dst])
     return math.inf if distance is None else distance
 
 
 def part_text(part: _Part, scope: b.Scope, writer: Writer) -> str:
-    """Return a node, edge or condition of a pattern as query text, with names for unnamed nodes."""
+    """Return a part of a pattern as query text: a node, edge or condition. Unnamed nodes get names."""
     if isinstance(part, b.Node):
         return writer.node(part.key, part.kinds)
     return writer.edge(part, scope) if isinstance(part, b.Edge) else writer.expression(part)
 
 
 def _named(at: Binding, scope: b.Scope) -> dict[str, str]:
-    """Return the names of the matched nodes: variable of the pattern → name of the node."""
+    """Return the names of the nodes in a match: variable → name of its node."""
     return {
         key: _name(at.view, at.nodes[key])
         for key, node in scope.nodes.items()
@@ -401,7 +401,7 @@ def _population(view: FrameView) -> str:
 
 
 def _between(edge: b.Edge, at: Binding, writer: Writer) -> str:
-    """Return the actual relations between the two nodes of an edge, in both directions, as query text."""
+    """Return the relations that exist between two nodes as query text, in both directions."""
     src, dst = at.nodes[edge.src], at.nodes[edge.dst]
     called = {src: writer.name(edge.src), dst: writer.name(edge.dst)}
     ways = []
@@ -422,7 +422,7 @@ def _between(edge: b.Edge, at: Binding, writer: Writer) -> str:
 
 
 def _values(condition: b.Bound, at: Binding, query: b.Query, writer: Writer) -> str:
-    """Return the actual values in a condition as query text, such as ``e.speed = 5.697``."""
+    """Return the values in a condition as query text, such as ``e.speed = 5.697``."""
     texts: dict[str, str] = {}
     for leaf in leaves(condition):
         name = writer.expression(leaf)
@@ -434,7 +434,7 @@ def _values(condition: b.Bound, at: Binding, query: b.Query, writer: Writer) -> 
 
 
 def _shown(name: str, value: Any) -> str:
-    """Return a named value as query text, such as ``e.speed = 5.697``."""
+    """Return a value with its name as query text, such as ``e.speed = 5.697``."""
     if value is None:
         return f"{name} IS NULL"
     if isinstance(value, bool):

@@ -87,7 +87,7 @@ class PatternParameter:
     choices: tuple[str, ...] = ()
 
     def written(self, value: object) -> str:
-        """Return a value of the parameter as query text. A value of the wrong type raises an error.
+        """Return a value as query text. Raise an error if the parameter has another type.
 
         Raises
         ------
@@ -133,12 +133,12 @@ class NamedPattern:
 
     @property
     def text(self) -> str:
-        """Query text of the pattern, with the default values of all parameters."""
+        """Query text of the pattern. All parameters have their default values."""
         return self.written()
 
     @property
     def example(self) -> str:
-        """Example scene of the pattern, drawn with letters. It is empty for a predicate."""
+        """Drawing of an example scene of the pattern, made of letters; empty for a predicate."""
         return _drawings().get(self.name, "")
 
     @property
@@ -147,7 +147,7 @@ class NamedPattern:
         return self.kind == "property"
 
     def written(self, **values: object) -> str:
-        """Return the query text of the pattern with the given parameter values.
+        """Return the query text of the pattern. Parameters have the given values.
 
         Parameters
         ----------
@@ -217,7 +217,7 @@ def patterns() -> Mapping[str, NamedPattern]:
 
 
 def pattern_named(name: str) -> NamedPattern:
-    """Return the pattern of the query library with a name.
+    """Return a pattern of the query library by name.
 
     Case and underscores count only if two names differ in nothing else.
 
@@ -241,7 +241,7 @@ def pattern_named(name: str) -> NamedPattern:
 
 @cache
 def predicates() -> Mapping[str, Define]:
-    """Return the predicates of the query library: name in lower case without underscores → definition.
+    """Return the predicates of the query library: normalised name (no capitals, no ``_``) → definition.
 
     Each is parsed on first use.
     """
@@ -280,7 +280,7 @@ def _drawings() -> Mapping[str, str]:
 
 @dataclass(slots=True)
 class _LibraryEntry:
-    """Pattern of the query library while its file is read line by line."""
+    """Pattern of the query library while its text is read, line by line."""
 
     kind: str
     name: str
@@ -364,7 +364,7 @@ def entries(text: str, library: str) -> Iterator[NamedPattern]:
 
 
 def _type_of(default: str) -> str | None:
-    """Return the type of a parameter from its default value: text, truth, duration or number."""
+    """Return the type of a parameter, from its default value: text, truth, duration or number."""
     if default.startswith("'"):
         return "text"
     if default in {"TRUE", "FALSE"}:

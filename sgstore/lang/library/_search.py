@@ -1,4 +1,4 @@
-"""Search of the query library for patterns by words."""
+"""Search for patterns of the query library by words."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _DOUBLED: Final = re.compile(r"([bdgmnpt])\1$")
 
 
 def _stem(word: str) -> str:
-    """Return a word without its ending: ``brak`` for ``brakes`` and ``braking``."""
+    """Return the stem of a word: ``brak`` for ``brakes`` and ``braking``."""
     stem = _ENDING.sub("", word)
     return _DOUBLED.sub(r"\1", stem)
 
@@ -114,7 +114,7 @@ def search(text: str, kinds: Collection[str] = ()) -> list[NamedPattern]:
 
 @cache
 def _index() -> tuple[Mapping[str, Mapping[str, float]], Mapping[str, float]]:
-    """Return the weight of each word per entry, and the rarity of each word in the library."""
+    """Return the weight of each word in each library pattern, and the rarity of each word."""
     places: dict[str, dict[str, float]] = {}
     for entry in patterns().values():
         parameters = " ".join(f"{p.name} {p.meaning}" for p in entry.parameters.values())
@@ -129,6 +129,6 @@ def _index() -> tuple[Mapping[str, Mapping[str, float]], Mapping[str, float]]:
 
 
 def _words(text: str) -> list[str]:
-    """Split a text into stems of lower-case words. Synonyms are replaced."""
+    """Split a text into words without endings. Synonyms are replaced by one word."""
     stems = [_stem(word.lower()) for word in _WORD.findall(text)]
     return [one for stem in stems for one in _SYNONYMS.get(stem, [stem])]

@@ -1,4 +1,4 @@
-"""Reader of user input that can be a pattern name, a query, a check or a formula."""
+"""Reader of user input: a pattern name, a query, a check or a formula."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _SQL: Final = ("SELECT", "WITH", "FROM", "DESCRIBE", "SHOW", "SUMMARIZE", "PIVOT
 def statement(
     text: str, values: Mapping[str, object], *, check: bool = False
 ) -> tuple[str, Mapping[str, object]]:
-    """Return a text of a user as a statement, and the values of its parameters.
+    """Return the user's text as a statement, and the values of its parameters.
 
     Parameters
     ----------
@@ -57,13 +57,13 @@ def statement(
 
 
 def first_word(text: str) -> str:
-    """Return the first word of a text in capitals, after comments; an empty text without a word."""
+    """Return the first word of a text in capitals. Comments are skipped. Without a word, return ""."""
     found = _FIRST_WORD.match(text)
     return "" if found is None else found[1].upper()
 
 
 def require_sql(text: str) -> None:
-    """Raise an error if a text is a query, a check or the name of a pattern instead of SQL.
+    """Raise an error if a text is not SQL, but a query, a check or a pattern name.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Search of query patterns in one scene graph in memory, without a database."""
+"""Search for query patterns in one scene graph in memory, without a database."""
 
 from sgstore.lang.memory._evaluate import Binding, Columns, column_evaluator
 from sgstore.lang.memory._frame_view import FrameView, NodePair

@@ -1,4 +1,4 @@
-"""Evaluation of query expressions in memory, for one match.
+"""Evaluation of query expressions in memory for a single match.
 
 Expressions have the same meaning as in :mod:`sgstore.lang.sql._masks`, which evaluates them in a store:
 ``None`` is NULL, and logic has three values.
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class Binding:
-    """Nodes and edges chosen for the query variables during the search of a scene graph.
+    """Nodes and edges that the search has chosen so far for the variables of a query.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ Blocks = Callable[[b.BlockValue], Evaluate]
 
 
 def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, PLR0911, PLR0912 - a case each
-    """Return a function that evaluates a query expression for chosen nodes and edges.
+    """Return a function that computes the value of an expression for the chosen nodes and edges.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def evaluator(expression: b.Bound, blocks: Blocks) -> Evaluate:  # noqa: C901, P
 
 
 def _of_node(node: str, attribute: Attribute) -> Evaluate:  # noqa: PLR0911 - a case each
-    """Return a function that evaluates an attribute of a node in memory."""
+    """Return a function that computes an attribute of a node in memory."""
     if attribute.unit is DisplayUnit.binding:
         return lambda at: at.nodes[node]
     if attribute.unit is DisplayUnit.role:
@@ -150,7 +150,7 @@ _UNSURE: Final = frozenset({UNSURE_LANE, UNSURE_LEAD})
 
 
 def _unsure(value: b.EdgeAttribute | b.FrameAttribute) -> Evaluate:
-    """Return a function that evaluates "later frames decide the lane" of an edge, the ego, or any vehicle."""
+    """Return a function that tests if a lane is not known yet, for an edge, the ego or any vehicle."""
     if isinstance(value, b.FrameAttribute) and value.attribute is UNSURE_LANE:
         return lambda at: at.view.graph.ego in at.view.graph.unsure_lane
     if isinstance(value, b.FrameAttribute):
@@ -160,19 +160,19 @@ def _unsure(value: b.EdgeAttribute | b.FrameAttribute) -> Evaluate:
 
 
 def _in_junction(at: Binding, node: int) -> bool | None:
-    """True if a map part (negative id) belongs to a junction. ``None`` for entities."""
+    """True if a part of the map belongs to a junction. None for entities."""
     return "junction" in at.view.nodes[node] if node < 0 else None
 
 
 def _text_of(value: Any) -> str | None:
-    """Return a JSON value as text, formatted like the database does; None stays None."""
+    """Return a JSON value as text, in the format of the database; None stays None."""
     if value is None or isinstance(value, str):
         return value
     return json.dumps(value, ensure_ascii=False, separators=(",", ":"))
 
 
 def _number_of(value: Any) -> Any:
-    """Return a JSON value if it is a number, otherwise None.
+    """Return a JSON value that is a number; None for other values.
 
     The same attribute may be a text in other traces.
     """
@@ -188,7 +188,7 @@ _OWN: Final[Mapping[Type, Callable[[Any], Any]]] = {
 
 
 def _lifetime(node: int, attributes: Attributes) -> int | None:
-    """Return the lifetime number of an entity: 1 for the first entity with its id, 2 for the second.
+    """Return which entity with this id a node is: 1 for the first one in the trace, 2 for the second.
 
     ``None`` for map parts.
     """
@@ -211,7 +211,7 @@ Columns = Callable[[T], Column]
 def column_evaluator(
     expression: b.Bound, leaf: Callable[[b.Bound], Columns[T] | None]
 ) -> Columns[T]:
-    """Return a function that evaluates a query expression with arrays, for many nodes or frames at once.
+    """Return a function that evaluates an expression with arrays: many nodes or frames at once.
 
     Parameters
     ----------
@@ -251,7 +251,7 @@ class _Alone(Exception):  # noqa: N818 - not an error: the condition is evaluate
 
 
 def crowd_test(condition: b.Bound, key: str) -> Test | None:
-    """Return a function that tests a condition for all candidate nodes of one variable at once.
+    """Return a function that tests a condition for many nodes at once: all candidates of a variable.
 
     ``None`` if the condition has a part without an array form.
 
@@ -314,7 +314,7 @@ def _of_crowd(part: b.Bound, key: str) -> Columns[Asked] | None:
 
 
 def _is_derived(attribute: Attribute) -> bool:
-    """True if a node attribute is computed, and not stored in the node as a number or boolean."""
+    """True if a node attribute must be computed, as the node has no number or boolean for it."""
     return attribute.unit in {
         DisplayUnit.inside,
         DisplayUnit.binding,
@@ -327,7 +327,7 @@ def _is_derived(attribute: Attribute) -> bool:
 
 
 def _of_others(value: b.NodeAttribute | b.PairNumber) -> Columns[Asked]:
-    """Return a function for a value that depends only on nodes that are already chosen.
+    """Return a function for a value that is equal for all candidates, as it uses only chosen nodes.
 
     The value is the same for all candidates.
     """

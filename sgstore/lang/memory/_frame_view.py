@@ -1,4 +1,4 @@
-"""Scene graph of one frame, indexed for the search of patterns in memory."""
+"""Scene graph of one frame, with indexes for the search of patterns."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ NodePair = tuple["int | None", "int | None"]
 
 @dataclass
 class FrameView:
-    """Scene graph of one frame, indexed for the search, with attributes of its frame and trace.
+    """Scene graph of one frame, with indexes for the search, and with attributes of frame and trace.
 
     Parameters
     ----------
@@ -75,14 +75,14 @@ class FrameView:
     drawn: SceneGraph | None = None
 
     def in_world(self) -> FrameView:
-        """Return the same frame for ``USING SCOPE world``: with data of entities outside its scene graph."""
+        """Return the same frame for ``USING SCOPE world``. It also has entities outside its scene graph."""
         known = self.graph.known()
         if known is self.graph:
             return self
         return replace(self, graph=known, drawn=self.graph)
 
     def linked(self, edge: b.Edge) -> FrameView:
-        """Return the view that contains the possible matches of an edge.
+        """Return the frame data in which an edge is searched: the scene graph, or all known data.
 
         For an edge in braces it has all data, otherwise the scene graph.
         """
@@ -99,12 +99,12 @@ class FrameView:
 
     @cached_property
     def nodes(self) -> Mapping[int, Attributes]:
-        """Attributes of the nodes of the frame: node id → attributes."""
+        """Attributes of all nodes of the frame: node id → attributes."""
         return self.graph.nodes
 
     @cached_property
     def by_kind(self) -> Mapping[str, list[int]]:
-        """Ids of the nodes of the frame: kind → node ids, including the ego."""
+        """Ids of all nodes of the frame, including the ego: kind → node ids."""
         found: defaultdict[str, list[int]] = defaultdict(list)
         for node, attributes in self.nodes.items():
             found[attributes["kind"]].append(node)
@@ -112,7 +112,7 @@ class FrameView:
 
     @cached_property
     def links(self) -> Mapping[tuple[int, int], dict[str, Attributes]]:
-        """Edges of the frame: pair of node ids → relation → attributes."""
+        """Edges of the frame: pair of node ids → relation → attributes of the edge."""
         found: defaultdict[tuple[int, int], dict[str, Attributes]] = defaultdict(dict)
         for src, relation, dst, attributes in self.graph.edges:
             found[src, dst][relation] = attributes
@@ -120,12 +120,12 @@ class FrameView:
 
     @cached_property
     def ahead(self) -> Mapping[tuple[str, int], list[int]]:
-        """Target nodes of the edges of the frame: (relation, source node) → target nodes."""
+        """Nodes to which edges of the frame lead: (relation, source node) → target nodes."""
         return self._neighbours(0, 2)
 
     @cached_property
     def back(self) -> Mapping[tuple[str, int], list[int]]:
-        """Source nodes of the edges of the frame: (relation, target node) → source nodes."""
+        """Nodes from which edges of the frame come: (relation, target node) → source nodes."""
         return self._neighbours(2, 0)
 
     def _neighbours(self, at: int, other: int) -> Mapping[tuple[str, int], list[int]]:
@@ -136,7 +136,7 @@ class FrameView:
 
     @cached_property
     def crowds(self) -> dict[b.Kinds, NodeColumns]:
-        """Cache of candidate nodes with their attribute columns, by allowed node kinds.
+        """Cache: allowed node kinds → the nodes of these kinds, with arrays of their attributes.
 
         :mod:`sgstore.lang.memory._evaluate` fills it.
         """
@@ -163,7 +163,7 @@ class FrameView:
         return self.roles() if self.roles else {}
 
     def happens(self, asked: b.Happened, nodes: tuple[int, ...]) -> bool | None:
-        """True if a recorded event in this frame involves the given nodes.
+        """True if the frame has a recorded event that involves the given nodes.
 
         ``None`` if the trace does not record such events.
         """
@@ -195,7 +195,7 @@ class FrameView:
         return None if math.isnan(value) else value
 
     def _by_lanes(self, name: str, one: int, other: int) -> float | None:
-        """Return a number that depends on lanes, such as the lane distance of two nodes, or None if unknown."""
+        """Return a number of two nodes that depends on lanes, such as their lane distance; None if unknown."""
         reach = self.graph.reach
         if reach is None:
             return None
@@ -208,7 +208,7 @@ class FrameView:
         return reach.between(*ends)
 
     def pairs(self, name: str, one: int, *, ahead: bool = True) -> Floats:
-        """Return the numbers (E,), such as ``gap``, between one entity and every entity of the frame.
+        """Return a number such as ``gap`` between one entity and each entity of the frame, (E,).
 
         The order is that of :attr:`rows`.
 
@@ -226,7 +226,7 @@ class FrameView:
         return self._pairs[key][name]
 
     def _on(self, node: int, *, parts: bool = False) -> Sequence[tuple[int, float, float]]:
-        """Return the stretches of lanes that an entity occupies, or with ``parts`` a map part."""
+        """Return the parts of lanes that an entity occupies. ``parts``: also those of a map part."""
         reach, kind = self.graph.reach, self.nodes[node]["kind"]
         if node >= 0 or reach is None:
             return self._stretches.get(node, ())
@@ -250,13 +250,13 @@ class FrameView:
 
     @cached_property
     def rows(self) -> Mapping[int, int]:
-        """Index of each entity in the arrays of pair numbers: node id → index."""
+        """Row of each entity in the arrays for numbers of entity pairs: node id → row."""
         known = (n for n, about in self.nodes.items() if about["kind"] not in MAP_KINDS)
         return {node: row for row, node in enumerate(known)}
 
     @cached_property
     def _boxes(self) -> Floats:
-        """Array (E, 15) of pose, size and motion of each entity, for pair numbers.
+        """Array with pose, size and motion of each entity, for numbers of entity pairs, (E, 15).
 
         Static entities have acceleration 0.
         """
@@ -282,7 +282,7 @@ class FrameView:
 
 
 class NodeColumns:
-    """Candidate nodes of a query variable in one frame, with arrays of their attributes.
+    """Nodes of one frame that a query variable may match, with arrays of their attributes.
 
     Parameters
     ----------
@@ -303,7 +303,7 @@ class NodeColumns:
     # The view is not stored, because it holds a reference to this object, and reference cycles are freed late.
 
     def attribute(self, view: FrameView, name: str, *, truth: bool) -> Column:
-        """Return an attribute of each candidate node (N,): numbers, or booleans if ``truth``."""
+        """Return an attribute of each node (N,), as numbers; as booleans if ``truth``."""
         column = self._columns.get(name)
         if column is None:
             nodes = view.nodes
@@ -317,7 +317,7 @@ class NodeColumns:
         return column
 
     def pair(self, view: FrameView, name: str, one: int, *, ahead: bool) -> Column:
-        """Return a number such as ``gap`` between one node and each candidate node (N,).
+        """Return a number such as ``gap`` between one node and each node of this object, (N,).
 
         If ``ahead`` is false, the candidate is the first of the pair.
         """
@@ -330,7 +330,7 @@ class NodeColumns:
 
 
 def attribute_of(about: Mapping[str, Any], name: str) -> Any:
-    """Return an attribute of a node. For entities, a missing noise mark means False."""
+    """Return an attribute of a node. A missing noise mark of an entity counts as False."""
     if name in NOISE_MARKS and "derived_velocity" in about:
         return about.get(name, False)
     return about.get(name)
@@ -342,7 +342,7 @@ def _known(values: Floats) -> Column:
 
 
 def crowd(view: FrameView, kinds: b.Kinds) -> NodeColumns:
-    """Return the nodes of a frame with allowed kinds, as columns. The result is cached in the view."""
+    """Return the nodes of a frame that have allowed kinds, with arrays of attributes. They are cached."""
     found = view.crowds.get(kinds)
     if found is None:
         found = view.crowds[kinds] = NodeColumns(view, kinds)

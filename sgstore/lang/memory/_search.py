@@ -1,4 +1,4 @@
-"""Search of query patterns in one scene graph in memory. The results equal those of the SQL.
+"""Search for query patterns in one scene graph in memory, with the same results as the SQL.
 
 The nodes of a pattern are bound one after the other. If an edge leads to a node, its candidates are the
 neighbours of a bound node. Each condition is tested as soon as all its variables are bound.
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class _SearchStep:
-    """Step of a pattern search: the variable, the source of its candidate nodes, and the tests of a candidate.
+    """Step of a pattern search: the variable, where its candidate nodes come from, and their tests.
 
     The tests in ``crowd`` run before binding, for all candidates at once.
     """
@@ -45,20 +45,20 @@ class _SearchStep:
 
     @property
     def among(self) -> bool:
-        """True if the candidates are all nodes of some kinds, not only neighbours of a node or the ego."""
+        """True if the candidates are all nodes of some kinds: not just the ego, or neighbours of a node."""
         return bool(self.key) and self.via is None and bool(self.kinds.other)
 
 
 @dataclass(slots=True)
 class _NamedEdge:
-    """Pattern edge that the search must choose, because it has a name or conditions."""
+    """Pattern edge that the search must choose, as the edge has a name or conditions."""
 
     edge: Edge
     tests: list[Evaluate]
 
 
 class ScopeSearch:
-    """Search plan of one graph pattern: the order in which the search chooses nodes for the variables."""
+    """Search plan of one graph pattern: the order of its variables, and the tests after each."""
 
     def __init__(self, scope: Scope, *, injective: bool) -> None:
         self._scope = scope
@@ -95,7 +95,7 @@ class ScopeSearch:
                 (place.tests if place else step.tests).append(test)
 
     def _order(self) -> list[_SearchStep]:
-        """Return the search steps: first nodes reached by edges, then the ego, then nodes with few kinds."""
+        """Return the search steps in a fast order: the ego, then nodes at edges, then nodes of few kinds."""
         scope, bound, steps = self._scope, set(self._scope.outer), list[_SearchStep]()
         left = dict.fromkeys(scope.nodes)
         while left:
@@ -114,7 +114,7 @@ class ScopeSearch:
         return steps
 
     def _way(self, key: str, bound: set[str]) -> Edge | None:
-        """Return an edge of the pattern that leads from an already chosen node to the given node, or None.
+        """Return an edge of the pattern from a node chosen earlier to the given node; None without one.
 
         Paths of several edges do not count.
         """
@@ -125,7 +125,7 @@ class ScopeSearch:
         return None
 
     def run(self, at: Binding) -> Iterator[None]:
-        """Yield None once for each match of the pattern. ``at`` then holds the chosen nodes and edges."""
+        """Yield once for each match of the pattern. Each time, ``at`` has the chosen nodes and edges."""
         if all(at.view.is_one(at.nodes[key], kinds) for key, kinds in self._outer):
             yield from self._bound(at, 0)
 
@@ -147,13 +147,13 @@ class ScopeSearch:
                 yield from self._bound(at, number)
 
     def _bound(self, at: Binding, number: int) -> Iterator[None]:
-        """Extend the chosen nodes by one search step. Yield once for each match."""
+        """Choose the nodes of the search step with this number, and of later ones. Yield once per match."""
         step = self._steps[number]
         if all(self._linked(at, edge) for edge in step.edges) and _all(step.tests, at):
             yield from self._name(at, number, 0)
 
     def _name(self, at: Binding, number: int, nth: int) -> Iterator[None]:
-        """Choose the edges of a search step that have names or conditions. Yield once for each match."""
+        """Choose the edges of a step that have names or conditions, then go on. Yield once per match."""
         step = self._steps[number]
         if nth == len(step.named):
             yield from self._bind(at, number + 1)
@@ -192,7 +192,7 @@ class ScopeSearch:
 
 
 def expression(of: b.Bound, *, injective: bool) -> Evaluate:
-    """Return a function that evaluates a query expression for chosen nodes and edges.
+    """Return a function that computes the value of an expression for the chosen nodes and edges.
 
     Parameters
     ----------
@@ -236,12 +236,12 @@ def _all(tests: list[Evaluate], at: Binding) -> bool:
 
 
 def _needs(condition: b.Bound) -> tuple[frozenset[str], frozenset[str]]:
-    """Return the node and edge variables that must have values before a condition can be tested."""
+    """Return the nodes and edges that must be chosen before a condition can be tested."""
     return b.nodes_of(condition), b.edges_of(condition)
 
 
 def _candidates(at: Binding, step: _SearchStep) -> Iterator[int]:
-    """Yield the candidate nodes of a search step: neighbours of a chosen node, or all nodes of some kinds."""
+    """Yield the nodes to try in a search step: neighbours of a chosen node, or all nodes of some kinds."""
     view, edge = at.view, step.via
     if edge is not None:
         forward = edge.dst == step.key
@@ -257,7 +257,7 @@ def _candidates(at: Binding, step: _SearchStep) -> Iterator[int]:
 
 
 def _fitting(at: Binding, step: _SearchStep) -> list[int]:
-    """Return the candidate nodes of a search step that pass its array tests."""
+    """Return the nodes to try in a search step. Nodes that fail a test on arrays are left out."""
     among = crowd(at.view, step.kinds)
     fits = step.crowd[0](at, among)
     for test in step.crowd[1:]:
@@ -268,7 +268,7 @@ def _fitting(at: Binding, step: _SearchStep) -> list[int]:
 def _steps(
     view: FrameView, relations: frozenset[str], here: int, *, both: bool, forward: bool = True
 ) -> Iterator[int]:
-    """Yield each neighbour of a node along edges with the given relations, without duplicates."""
+    """Yield once each neighbour of a node along edges with the given relations."""
     sides = (view.ahead, view.back) if both else (view.ahead,) if forward else (view.back,)
     found: dict[int, None] = {}
     for side in sides:
@@ -278,7 +278,7 @@ def _steps(
 
 
 def _between(at: Binding, edge: Edge) -> Iterator[tuple[str, Attributes]]:
-    """Yield relation and attributes of the edges between the two chosen nodes of a pattern edge.
+    """Yield relation and attributes of each edge between two chosen nodes that a pattern edge matches.
 
     Each relation occurs once.
     """
@@ -322,12 +322,12 @@ class StageSearch:
         return rows
 
     def value(self, of: b.Bound) -> Evaluate:
-        """Return a function that evaluates an expression for one match. Optional nodes may be missing."""
+        """Return a function that computes an expression for one match. Optional nodes may be missing."""
         return _value(of, injective=self._injective)
 
 
 class _Joining:
-    """``MATCH`` or ``OPTIONAL MATCH`` clause: extends each previous match by the matches of a pattern."""
+    """``MATCH`` or ``OPTIONAL MATCH`` clause. It extends each match by the matches of its pattern."""
 
     def __init__(self, stage: b.MatchStage, injective: bool) -> None:  # noqa: FBT001
         self._stage = stage
@@ -363,7 +363,7 @@ class _Joining:
         return found
 
     def _beside(self, view: FrameView, row: Binding) -> Iterator[Binding]:
-        """Yield the given match, extended by each match of the clause's pattern."""
+        """Yield one extended match for each match of the clause's pattern."""
         if _absent(row, self._stage.scope.outer, ()):
             return
         told: set[object] = set()
@@ -392,7 +392,7 @@ def _row(view: FrameView, nodes: Any, edges: Any, passed: Any) -> Binding:
 
 
 class _Passing:
-    """``WITH`` clause: groups, sorts and limits the matches of a frame, and keeps the listed values."""
+    """``WITH`` clause: it groups, sorts and limits the matches of a frame, and keeps the listed values."""
 
     def __init__(self, stage: b.WithStage, injective: bool) -> None:  # noqa: FBT001
         self._stage, self._injective = stage, injective
@@ -424,7 +424,7 @@ class _Passing:
         return [row for row in found if all(test(row) is True for test in self._where)]
 
     def _passed(self, row: Binding, *, bare: bool = False) -> Binding:
-        """Return a match that has only the names and values that ``WITH`` passes on.
+        """Return a match with the names and values that ``WITH`` passes on.
 
         With ``bare``, all others are removed.
         """
@@ -438,7 +438,7 @@ class _Passing:
         return Binding(row.view, nodes, edges, passed)
 
     def _groups(self, rows: Rows) -> Rows:
-        """Return one row for each combination of the grouping values of ``WITH``."""
+        """Return one match for each group: the combination of grouping values of a ``WITH`` clause."""
         members: dict[object, Rows] = {}
         kept: dict[object, Binding] = {}
         for row in rows:
@@ -456,7 +456,7 @@ class _Passing:
         return list(kept.values())
 
     def _counted(self, value: b.Bound, rows: Rows, told: Mapping[str, Any]) -> Any:
-        """Return the value of an expression with aggregates, over the matches of one group."""
+        """Return the value of an expression with aggregates for one group of matches."""
         match value:
             case b.Aggregate():
                 return _aggregate(value, rows, injective=self._injective)
@@ -474,14 +474,14 @@ def _always(value: Any) -> Evaluate:
 
 
 def _place(row: Binding) -> tuple[tuple[bool, Any], ...]:
-    """Return the default sort key of a match: its node ids, relations and passed values."""
+    """Return the key that sorts matches by default: node ids, relations and ``WITH`` values."""
     nodes = [row.nodes[key] for key in sorted(row.nodes)]
     edges = [row.edges[key] and row.edges[key][0] for key in sorted(row.edges)]
     return tuple((one is None, one or 0) for one in (*nodes, *edges, *row.passed.values()))
 
 
 def _aggregate(of: b.Aggregate, rows: Rows, *, injective: bool) -> Any:
-    """Return the value of an aggregate, such as ``COUNT``, over the given matches.
+    """Return the value of an aggregate, such as ``COUNT``, for the given matches.
 
     See :mod:`sgstore.lang.bind._aggregates`.
     """
@@ -522,7 +522,7 @@ _OF_NOTHING: Final = {"EXISTS": False, "COUNT": 0, "SUM": 0.0}
 
 
 def _value(of: b.Bound, *, injective: bool) -> Evaluate:
-    """Return a function that evaluates an expression for one match in which optional nodes may be missing."""
+    """Return a function that computes an expression for one match. Optional nodes may be missing."""
     match of:
         case b.Operation(word=word, operands=operands):
             return OPERATORS[word].one([_value(one, injective=injective) for one in operands])

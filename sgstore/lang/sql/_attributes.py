@@ -1,4 +1,4 @@
-"""SQL expressions for attributes of nodes, frames and traces."""
+"""SQL for the attributes of nodes, frames and traces."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Aliases:
-    """SQL aliases of the tables that hold the attributes of a node.
+    """SQL aliases of the joined tables that contain the attributes of a node.
 
     ``None`` means that the table is not joined.
     """
@@ -48,7 +48,7 @@ _ABSENT: Final = {
 
 
 def attribute_text(attribute: Attribute, at: Aliases) -> str:
-    """Return the SQL expression of a node attribute. Its value may be in one of several tables."""
+    """Return the SQL of a node attribute. Its value may be in one of several tables."""
     if attribute.unit is DisplayUnit.label:
         return _label(at)
     if attribute.name == "kind" and at.state and not (at.entity or at.map):
@@ -73,7 +73,7 @@ def attribute_text(attribute: Attribute, at: Aliases) -> str:
 
 
 def raw_text(name: str, at: Aliases, *, upright: bool = False) -> str:
-    """Return the SQL expression of a stored number of a node, such as ``x``.
+    """Return the SQL of a stored number of a node, such as ``x``.
 
     Positions are relative to the origin of the trace.
 
@@ -106,7 +106,7 @@ def raw_text(name: str, at: Aliases, *, upright: bool = False) -> str:
 
 
 def _side_text(name: str, at: Aliases, *, upright: bool) -> str:
-    """Return the SQL expression for the height of a body's lower or upper side.
+    """Return the SQL of the height of a body's lower or upper side.
 
     It is NULL for signals and map parts.
     """
@@ -128,7 +128,7 @@ def _side_text(name: str, at: Aliases, *, upright: bool) -> str:
 
 
 def owner_text(node: str, profile: Profile, trace: str, road_map: str) -> str:
-    """Return SQL for the owner of a node id: the trace of an entity, or the map of a map part (negative id)."""
+    """Return the SQL of the owner of a node id: the trace for an entity, the map for a part of the map."""
     if not profile.mapped:
         return trace
     of_map = f"coalesce({road_map}, -1 - ({trace}))"
@@ -138,14 +138,14 @@ def owner_text(node: str, profile: Profile, trace: str, road_map: str) -> str:
 
 
 def role_text(frame: str, node: str) -> str:
-    """Return the SQL expression for the role of a lane relative to the ego in a frame."""
+    """Return the SQL of the role of a lane in a frame, relative to the ego."""
     on = [f'":r"."frame_id" = {frame}', f'":r"."node_id" = {node}']
     role = Select(['any_value(":r"."role")'], ['"roles" AS ":r"'], on)
     return f"({role.text()})"
 
 
 def own_text(attribute: Attribute, frame: str, node: str, edge: Sequence[str] = ()) -> str:
-    """Return the SQL expression of a user-defined attribute of a node or edge in a frame.
+    """Return the SQL of a user-defined attribute of a node or edge in a frame.
 
     The attribute belongs to a node, or to the edge from this node with the given relation and other end.
     """
@@ -170,7 +170,7 @@ def own_text(attribute: Attribute, frame: str, node: str, edge: Sequence[str] = 
 
 
 def _map_own_text(attribute: Attribute, frame: str, node: str) -> str:
-    """Return the SQL expression of an attribute of a lane or sign, from the places of its map."""
+    """Return the SQL of an attribute of a lane or sign that the table ``map_place`` contains."""
     told = f'json_extract_string(":p"."what", {literal(f"$.{attribute.name}")})'
     kind = "VARCHAR" if attribute.type is Type.text else _NATIVE[attribute.type]
     on = [
@@ -232,7 +232,7 @@ def _label(at: Aliases) -> str:
 
 
 def as_type(column: str, kind: Type) -> str:
-    """Return SQL that converts a column of a user table to a value type of the query language."""
+    """Return SQL that converts a column of a user table to a type of the query language."""
     return f"CAST({column} AS {_NATIVE[kind]})"
 
 
@@ -240,7 +240,7 @@ _NATIVE: Final = {Type.number: "DOUBLE", Type.text: "VARCHAR", Type.boolean: "BO
 
 
 def frame_text(leaf: FrameAttribute | TraceAttribute, frame: str, trace: str, map_: str) -> str:
-    """Return the SQL expression of an attribute of the frame or trace."""
+    """Return the SQL of an attribute of the frame or trace."""
     attribute = leaf.attribute
     home, column = next(iter(attribute.columns.items()))
     if attribute.unit in {
@@ -274,7 +274,7 @@ def frame_text(leaf: FrameAttribute | TraceAttribute, frame: str, trace: str, ma
 
 
 def seconds_text(ns: str) -> str:
-    """Return the SQL that converts nanoseconds to seconds, as :func:`sgstore.model.world.seconds_of`."""
+    """Return SQL that converts nanoseconds to seconds, like :func:`sgstore.model.world.seconds_of`."""
     return f"round(CAST({ns} AS DOUBLE) / 1e3) / 1e6"
 
 
@@ -285,7 +285,7 @@ def _class_text(abstraction: str, frame: str) -> str:
 
 
 def _looked_up(attribute: Attribute, frame: str) -> str:
-    """Return the SQL expression of a frame attribute that is computed from other frames or from events."""
+    """Return the SQL of a frame attribute that depends on other frames or on events."""
     column = next(iter(attribute.columns.values()))
     if attribute.unit in {DisplayUnit.weather, DisplayUnit.clock}:
         return _weather_text(column, frame)
@@ -308,7 +308,7 @@ def _looked_up(attribute: Attribute, frame: str) -> str:
 
 
 def _given_text(attribute: Attribute, abstraction: str, frame: str) -> str:
-    """Return SQL for a frame attribute that needs the frame classes of all stores of a collection."""
+    """Return the SQL of a frame attribute that depends on all stores of a collection."""
     seen = attribute.unit is DisplayUnit.seen
     dataset = attribute.name.removeprefix(f"class_{abstraction} in ") if seen else ""
     on = [f'"k"."abstraction" = {literal(abstraction)}', f'"k"."dataset" = {literal(dataset)}']
@@ -322,7 +322,7 @@ def _given_text(attribute: Attribute, abstraction: str, frame: str) -> str:
 
 
 def _weather_text(word_: str, frame: str) -> str:
-    """Return SQL for a weather attribute of a frame: its value in the last weather event up to the frame."""
+    """Return the SQL of a weather attribute: its value in the last weather event up to the frame."""
     told = f'regexp_extract("v"."detail", \'(^|, ){word_}=([^,]*)\', 2)'
     if word_ == "time_of_day":
         parts = [
@@ -346,5 +346,5 @@ def _weather_text(word_: str, frame: str) -> str:
 
 
 def among(column: str, numbers: list[int]) -> str:
-    """Return the SQL condition that a column is in a list of integers."""
+    """Return the SQL condition that a column is one of some integers."""
     return f"({column}) IN ({', '.join(map(str, numbers))})" if numbers else "FALSE"

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Compiled:
-    """Compiled query: builds the SQL statements for its results, such as rows, frames or intervals.
+    """Compiled query. It builds SQL statements for results such as rows, frames or intervals.
 
     Attributes
     ----------
@@ -68,12 +68,12 @@ class Compiled:
 
     @property
     def whole(self) -> Query:
-        """Query before rewriting. For ``RETURN SUBGRAPHS``, the query for the rows with the subgraphs."""
+        """Query before rewriting. For ``RETURN SUBGRAPHS``, it has columns for the values of the subgraphs."""
         return self.bound if self.layout is None else Layout.of(self.bound).query
 
     @property
     def layout(self) -> Layout | None:
-        """Positions of graph values in the rows of ``RETURN SUBGRAPHS``. ``None`` for other results."""
+        """For ``RETURN SUBGRAPHS``, the positions of the graph values in a row; otherwise None."""
         return Layout.of(self.bound) if self.bound.result.form == "subgraphs" else None
 
     @property
@@ -85,14 +85,14 @@ class Compiled:
 
     @property
     def chosen(self) -> tuple[TraceFacts, ...]:
-        """Traces that the query settings select, including traces that lack necessary data."""
+        """Traces selected by the settings of the query, including those that lack needed data."""
         only, ego = self.catalog.only, self.query.ego
         chosen = [t for t in self.catalog.traces if ego in {None, t.ego}]
         return tuple(t for t in chosen if only is None or t.trace_id in only)
 
     @property
     def reasons(self) -> dict[str, str]:
-        """Selected traces that lack a relation of the query: trace name → message for the user."""
+        """Selected traces without a relation that the query uses: trace name → message for the user."""
         if self.query.unknown_is_false:
             return {}
         wanted = self.query.relations
@@ -101,18 +101,18 @@ class Compiled:
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """Names of the selected traces that lack a relation of the query."""
+        """Names of the selected traces without a relation that the query uses."""
         return tuple(self.reasons)
 
     def rows(self, window: Window | None = None, query: Query | None = None) -> SqlStatement:
-        """Return the SQL for the result rows of the query, or of another query with the same pattern."""
+        """Return the SQL for the result rows of this query, or of a query with the same pattern."""
         query, writer, span = self._told(query or self.query, window)
         return results.rows(query, self.catalog, window, writer, span)
 
     def _told(
         self, query: Query, window: Window | None
     ) -> tuple[Query, SqlBuilder | None, results.Span | None]:
-        """Return the query, a builder for matches computed elsewhere (or None), and the span columns (or None).
+        """Return three parts for the SQL: the query, a builder of computed matches, and the span columns.
 
         Builder and span can be None.
         """
@@ -132,16 +132,16 @@ class Compiled:
         return query, external_matches(query, self.catalog, found, told), span
 
     def frames(self, window: Window | None = None) -> SqlStatement:
-        """Return the SQL for the matching frames, without duplicates, with their log times."""
+        """Return the SQL for all matching frames, each once, with their log times."""
         query, writer, _ = self._told(replace(self.query, result=Result()), window)
         return results.frames(query, self.catalog, window, writer)
 
     def bindings(self, window: Window | None = None) -> SqlStatement:
-        """Return the SQL for frames with their matched nodes and edges. ``RETURN`` is ignored."""
+        """Return the SQL for matching frames with the matched nodes and edges. ``RETURN`` has no effect."""
         return self.rows(window, replace(self.query, result=Result()))
 
     def intervals(self, window: Window | None = None) -> SqlStatement:
-        """Return the SQL for intervals of frames in which the returned values stay constant.
+        """Return the SQL for intervals: series of frames in which the returned values stay the same.
 
         Without ``RETURN``, the matched nodes stay constant.
 
@@ -157,11 +157,11 @@ class Compiled:
         return self.rows(window, query)
 
     def bound_intervals(self, window: Window | None = None) -> SqlStatement:
-        """Return the SQL for intervals of frames in which the same nodes match. ``RETURN`` is ignored."""
+        """Return the SQL for intervals in which the same nodes match. ``RETURN`` has no effect."""
         return self.rows(window, results.with_bindings(self.query))
 
     def clips(self, before_ns: int, after_ns: int, window: Window | None = None) -> SqlStatement:
-        """Return the SQL for clips around the matching frames. ``RETURN CLIPS`` can override the two offsets.
+        """Return the SQL for clips around matching frames. ``RETURN CLIPS`` has priority over both offsets.
 
         Parameters
         ----------
@@ -175,12 +175,12 @@ class Compiled:
         return self.rows(window, replace(self.query, result=result))
 
     def told_apart(self) -> Compiled:
-        """Return a copy of the query with the owner (trace or map) of each node as an extra column."""
+        """Return a copy with one more column for each node: its owner, which is a trace or a map."""
         result = with_owners(self.query.result)
         return replace(self, query=replace(self.query, result=result))
 
     def limited(self, most: int) -> Compiled:
-        """Return a copy of the query that returns at most ``most`` rows, as with ``LIMIT``."""
+        """Return a copy whose result has at most ``most`` rows, as with ``LIMIT``."""
 
         def limit(query: Query) -> Query:
             held = query.result.limit
@@ -191,7 +191,7 @@ class Compiled:
 
     @property
     def in_windows(self) -> bool:
-        """True if the result can be computed in separate time windows."""
+        """True if the result can be computed for one window of frames after another."""
         result = self.query.result
         framed = result.whole or result.framed or result.form != "rows"
         across = result.distinct and not framed
@@ -200,7 +200,7 @@ class Compiled:
 
     @property
     def limited_to_frames(self) -> Compiled | None:
-        """Return a copy that also returns frame and log time of each row. ``None`` if no limit drops rows."""
+        """If a limit removes rows, return a copy that adds frame and log time to each row; otherwise None."""
         result = self.query.result
         if not result.chooses or result.form != "rows" or result.aggregated:
             return None
@@ -211,18 +211,18 @@ class Compiled:
 
     @property
     def drops_intervals(self) -> bool:
-        """True if the query returns intervals, and a limit or a condition on them drops some."""
+        """True if the query returns intervals, and a limit or condition removes some of them."""
         result = self.query.result
         return result.form == "intervals" and result.chooses and not result.aggregated
 
     @property
     def drops_frames(self) -> bool:
-        """True if a limit or a condition on rows or intervals drops matching frames."""
+        """True if a limit or a condition removes matching frames from the result."""
         return self.limited_to_frames is not None or self.drops_intervals
 
     @property
     def listed(self) -> Compiled | None:
-        """Return a copy for the same rows, with the nodes of each match; see :func:`listed_matches`."""
+        """Return a copy with the same rows, and the nodes of each match; see :func:`listed_matches`."""
         query, layout = self.query, self.layout
         if layout is not None:  # without the values of the nodes
             own = query.result.columns[: len(self.bound.result.columns)]
@@ -231,7 +231,7 @@ class Compiled:
         return query and replace(self, bound=query, query=query)
 
     def stages(self) -> str:
-        """Return the query as text after each stage of the compiler, from the syntax tree to SQL."""
+        """Return the query as text after each stage of the compiler: syntax tree, resolved names, …, SQL."""
         statements = parse(self.text)
         statement = self.rows()
         values = "".join(f"\n${i} = {v!r}" for i, v in enumerate(statement.values, start=1))
@@ -285,7 +285,7 @@ def compile_query(
 def compile_checks(
     text: str, catalog: Catalog, parameters: Mapping[str, Any] | None = None
 ) -> tuple[CheckInCatalog, ...]:
-    """Return the ``CHECK`` statements of a text with resolved names.
+    """Resolve the names in the ``CHECK`` statements of a text.
 
     Their SQL is generated when the check runs.
 
@@ -307,7 +307,7 @@ def compile_checks(
 
 
 def _seen(statements: Sequence[object], catalog: Catalog, parameters: Mapping[str, Any]) -> Catalog:
-    """Return the catalog for the abstraction, dataset and scope in the ``USING`` settings."""
+    """Return the catalog that the ``USING`` settings select by abstraction, dataset and scope."""
     seen, world = catalog, any(isinstance(one, CheckClause) for one in statements)
     for statement in statements:
         for setting in (

@@ -1,4 +1,4 @@
-"""Result rows of a query, shortened for display."""
+"""Result rows of a query in a short form for display."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 def for_people(
     columns: tuple[str, ...], rows: Iterable[tuple[Any, ...]], *, graphs: bool
 ) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
-    """Return the columns and rows of a result in a shorter form for display.
+    """Return columns and rows of a result in a short form for display.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def for_people(
 
 
 def _named(name: str) -> str | None:
-    """Return the variable ``v`` if the column is ``v.name``; otherwise None."""
+    """If the column is ``v.name``, return ``v``; otherwise None."""
     return name.removesuffix(".name") if name.endswith(".name") else None
 
 

@@ -50,7 +50,7 @@ _PLACES: Final = frozenset({"span", "name_span"})
 
 
 def tree_text(part: Any) -> str:
-    """Return a syntax tree as text, one part per line, without positions and absent parts."""
+    """Return a syntax tree as text: one line for each part. Positions and absent parts are left out."""
     return "\n".join(_tree(part, ""))
 
 
@@ -89,7 +89,7 @@ def query_text(query: Query) -> str:
 
 
 def _stage(stage: Stage) -> list[str]:
-    """Return one clause (``MATCH`` or ``WITH``) of a query as readable lines of text."""
+    """Return a ``MATCH`` or ``WITH`` clause of a query as readable lines of text."""
     if isinstance(stage, MatchStage):
         return ["optional match" if stage.optional else "match", *_scope(stage.scope, "  ")]
     nodes = [new if new == key else f"{key} AS {new}" for new, key in stage.nodes]
@@ -108,7 +108,7 @@ def _stage(stage: Stage) -> list[str]:
 
 
 def _passed(name: str) -> str:
-    """Return the name of a ``WITH`` value as it appears in the query text."""
+    """Return the name that the query text gives to a ``WITH`` value."""
     return name.removeprefix(PASSED).rpartition(" ")[0]
 
 
@@ -135,7 +135,7 @@ def edge_text(edge: Edge) -> str:
 
 
 def kinds_text(kinds: Kinds) -> str:
-    """Return the allowed kinds of a pattern node as readable text, such as ``the ego``."""
+    """Return the kinds allowed for a pattern node as readable text, such as ``the ego``."""
     if kinds == any_kinds():
         return "anything"
     entities = entity_kinds()
@@ -153,7 +153,7 @@ def _kinds(kinds: frozenset[str]) -> str:
 
 
 def unnumbered_text(value: Bound) -> str:
-    """Return an expression as readable text, without the numbers of unnamed nodes."""
+    """Return an expression as readable text. The numbers of unnamed nodes are left out."""
     return _NUMBERED.sub(lambda found: "#" if found[0][0] == "#" else found[0], value_text(value))
 
 
@@ -162,7 +162,7 @@ _NUMBERED: Final = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|#\d+""")
 
 
 def value_text(value: Bound, indent: str = "") -> str:  # noqa: PLR0911 - a case each
-    """Return an expression as readable text, close to the query language."""
+    """Return an expression as readable text in almost the syntax of the query language."""
     match value:
         case Value(value=constant):
             return "NULL" if constant is None else repr(constant)

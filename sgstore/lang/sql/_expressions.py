@@ -1,4 +1,4 @@
-"""SQL of query expressions: values, attributes, conditions and numbers of entity pairs."""
+"""SQL of query expressions: values, attributes, conditions, and numbers of entity pairs."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 
 def pair_column(name: str, a: str, b: str) -> str:
-    """Return the SQL column for a number of two entities, or for an attribute of one of them.
+    """Return the SQL column that has a number of two entities, or an attribute of one of them.
 
     ``a_x`` means x of entity a.
     """
@@ -51,7 +51,7 @@ def pair_column(name: str, a: str, b: str) -> str:
 
 
 def pair_text(name: str, a: str, b: str, without: frozenset[str] = frozenset()) -> str:
-    """Return the SQL that computes a number of two entities from columns of inner SELECT statements."""
+    """Return the SQL of a number of two entities, from columns of a nested SELECT statement."""
     return pair_sql(name, lambda part: pair_column(part, a, b), without)
 
 
@@ -71,7 +71,7 @@ Leaf = (
 
 
 def expression_text(expression: Bound, leaf: Callable[[Leaf], str], values: BoundValues) -> str:
-    """Return the SQL of a query expression. ``leaf`` returns the SQL of its attributes and other leaves."""
+    """Return the SQL of a query expression. ``leaf`` returns the SQL of each attribute in it."""
     match expression:
         case Value():
             return _value(expression, values)
@@ -115,7 +115,7 @@ def _operation(operation: Operation, leaf: Callable[[Leaf], str], values: BoundV
 def _compared(
     operand: Bound, operation: Operation, leaf: Callable[[Leaf], str], values: BoundValues
 ) -> str:
-    """Return the SQL of one side of a comparison. Columns with an enumerated type need no cast."""
+    """Return the SQL of one side of a comparison. A column with an enumerated type needs no cast."""
     closed = all(
         (isinstance(o, Value) and o.closed) or (isinstance(o, NodeAttribute) and o.attribute.values)
         for o in operation.operands
@@ -141,7 +141,7 @@ def _membership(
 
 
 def leaves(expression: Bound) -> Iterable[Leaf]:
-    """Yield the parts of an expression that SQL reads from a column, such as attributes."""
+    """Yield the parts of an expression, such as attributes, that SQL reads from a column."""
     match expression:
         case Value() | Choices() | LabelTest() | GroupKey() | Tense() | SignalCall():
             return
@@ -158,14 +158,14 @@ def leaves(expression: Bound) -> Iterable[Leaf]:
 
 
 def columns_of(nodes: frozenset[str], edges: frozenset[str] = frozenset()) -> list[str]:
-    """Return the quoted names of the SQL columns that hold node ids and edge relations of a match."""
+    """Return the quoted SQL columns for the node ids and the edge relations of a match."""
     return [quoted(f"{key}.id") for key in sorted(nodes)] + [
         quoted(f"{key}.type") for key in sorted(edges)
     ]
 
 
 def column_of(leaf: Leaf) -> str:
-    """Return the SQL column name for a leaf of an expression, such as an attribute."""
+    """Return the SQL column for a part of an expression, such as an attribute."""
     match leaf:
         case NodeValue(node=owner):
             name = "id"
@@ -201,7 +201,7 @@ def _as_column(attribute: Attribute) -> str:
 
 
 def edge_table(edge: Edge, src: str, dst: str) -> tuple[str, dict[str, str]]:
-    """Return the table that holds the attributes of an edge, and its columns for the two nodes.
+    """Return the table with the attributes of an edge, and the columns of its two nodes.
 
     The ends of an ``isIn`` edge are an entity, with an id of 0 or above, and a lane, with a negative id. A
     gap is stored once, with the follower first.
@@ -214,13 +214,13 @@ def edge_table(edge: Edge, src: str, dst: str) -> tuple[str, dict[str, str]]:
 
 
 def lane_text(leaf: Leaf, alias: str) -> str:
-    """Return the SQL of an edge attribute, read from a row of :func:`edge_table`."""
+    """Return the SQL of an edge attribute, from a row of :func:`edge_table`."""
     assert isinstance(leaf, EdgeAttribute)  # noqa: S101 - the condition was filed so
     return attribute_text(leaf.attribute, Aliases(state=alias))
 
 
 def is_position(leaf: Leaf) -> bool:
-    """True if an expression is a coordinate, which is stored relative to the origin of the trace."""
+    """True if an expression is a coordinate of a node. The store has it relative to the trace's origin."""
     return isinstance(leaf, NodeAttribute) and leaf.attribute.unit in {
         DisplayUnit.east,
         DisplayUnit.north,
@@ -229,14 +229,14 @@ def is_position(leaf: Leaf) -> bool:
 
 
 def is_constant(leaf: Leaf) -> bool:
-    """True if an expression is a node attribute that never changes during the life of an entity."""
+    """True if an expression is an attribute of a node that never changes while the entity exists."""
     if not isinstance(leaf, NodeAttribute):
         return False
     return Home.entity in leaf.attribute.columns or leaf.attribute.unit is DisplayUnit.label
 
 
 def node_text(condition: Bound, node: str, at: Aliases, values: BoundValues) -> str:
-    """Return the SQL of a condition on one node, from its id column and the aliases of its tables."""
+    """Return the SQL of a condition on one node, from its id column and its tables' aliases."""
 
     def leaf(found: Leaf) -> str:
         if isinstance(found, NodeAttribute) and found.attribute.unit is not DisplayUnit.binding:
@@ -249,7 +249,7 @@ def node_text(condition: Bound, node: str, at: Aliases, values: BoundValues) -> 
 def bound_text(
     condition: Bound, nodes: Mapping[str, str], edges: Mapping[str, str], values: BoundValues
 ) -> str:
-    """Return the SQL of a condition on node ids and edge relations only."""
+    """Return the SQL of a condition that uses only node ids and edge relations."""
 
     def leaf(found: Leaf) -> str:
         match found:
@@ -264,7 +264,7 @@ def bound_text(
 
 
 def trace_text(condition: Bound, trace: str, values: BoundValues) -> str:
-    """Return the SQL of a condition on attributes of the trace. ``trace`` is the SQL of the trace id."""
+    """Return the SQL of a condition on trace attributes. ``trace`` is the SQL of the trace id."""
     select = Select(['"t"."trace_id"'], ['"trace" AS "t"'])
     select.join('"map" AS "m"', ['"m"."map_id" = "t"."map_id"'], "LEFT JOIN")
 

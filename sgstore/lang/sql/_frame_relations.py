@@ -1,4 +1,4 @@
-"""SQL for the frames, the entities and the traces that match a query.
+"""SQL for the frames, entities and traces that a query matches.
 
 Conditions over several frames are evaluated on columns read from a store (:func:`relation`). The matches then
 become a relation again (:mod:`sgstore.lang.sql._known_matches`).
@@ -64,7 +64,7 @@ def relation(
     *,
     masked: bool = False,
 ) -> SqlStatement:
-    """Return the SQL for the frames in which a pattern matches, with the ids of the matched nodes.
+    """Return the SQL for the frames that match a pattern, and for the ids of the matched nodes.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ TRACES: Final = 'SELECT "trace_id", "name", "start_ns", coalesce("period_ns", 0)
 
 
 def entities(query: Query, node: str, catalog: Catalog, window: Window | None) -> SqlStatement:
-    """Return the SQL for all entities that can match a node of the pattern in any frame of a trace.
+    """Return the SQL for all entities of a trace that match a node of the pattern in some frame.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ def entities(query: Query, node: str, catalog: Catalog, window: Window | None) -
 
 
 def traces_with(kinds: Kinds, attribute: Attribute | None, *, moving: bool) -> str:
-    """Return the SQL for the traces that have a node of the given kinds with a known attribute.
+    """Return the SQL for the traces with a node that has one of the given kinds and a known attribute.
 
     The statement reads tables without a frame join, so it is fast in a large store.
 

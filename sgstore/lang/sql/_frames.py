@@ -1,4 +1,4 @@
-"""SQL of the second phase: values and conditions of single frames, for the candidates of the first phase.
+"""SQL of the second phase: it tests the candidate frames of the first phase with values of each frame.
 
 The frames from the first phase are joined with ``state`` (and the tables of constants) for each node whose
 values are needed. Statements around that join compute pair numbers and test conditions.
@@ -94,7 +94,7 @@ MAP: Final = '":map"'
 
 
 def phases(sql: SqlBuilder, scope: Scope) -> Phases:
-    """Return the conditions of a pattern, grouped by SQL phase.
+    """Return the conditions of a pattern, grouped by the SQL phase that tests them.
 
     Matches that are computed already need no tests.
     """
@@ -110,7 +110,7 @@ def masks(
     edges: frozenset[str] = frozenset(),
     kinds: frozenset[str] = frozenset(),
 ) -> str:
-    """Return SQL of the first phase: node ids of each match, with its frames as 64-bit masks.
+    """Return SQL of the first phase: a row has the node ids of a match, and its frames as a 64-bit mask.
 
     ``kinds`` are nodes whose kind is also a column; they must be in :func:`told_kinds`.
     """
@@ -126,7 +126,7 @@ def masks(
 
 
 def existence(sql: SqlBuilder, scope: Scope, given: SharedRelation | None) -> str:
-    """Return SQL for ``EXISTS {…}``: outer node ids of each match, with its frames as 64-bit masks."""
+    """Return SQL for ``EXISTS {…}``: per match, ids of the nodes from outside the braces, and a frame mask."""
     keys = frozenset(scope.outer)
     parts = phases(sql, scope)
     if parts.rest or parts.late:
@@ -140,7 +140,7 @@ def existence(sql: SqlBuilder, scope: Scope, given: SharedRelation | None) -> st
 def _block(
     sql: SqlBuilder, condition: Bound, given: SharedRelation
 ) -> tuple[str, frozenset[str], bool]:
-    """Return SQL for ``EXISTS {…}`` or a count, its outer nodes, and False for a negated condition."""
+    """For a condition with braces, return SQL, nodes from outside the braces, and False if negated."""
     match condition:
         case BlockValue(scope=scope):
             return existence(sql, scope, given), frozenset(scope.outer), True
@@ -174,13 +174,13 @@ def _block_counted(
 def block_matches(
     sql: SqlBuilder, block: BlockValue, given: SharedRelation | None, columns: Iterable[Leaf] = ()
 ) -> str:
-    """Return SQL for all matches of a pattern in braces: one row for each frame and match."""
+    """Return SQL for all matches of a pattern in braces: one row per frame and match."""
     nodes, edges = _told_apart(block.scope)
     return frames(sql, block.scope, given, nodes, edges, columns)
 
 
 def _told_apart(scope: Scope) -> tuple[frozenset[str], frozenset[str]]:
-    """Return the nodes and edges whose values make two matches of a pattern in braces different."""
+    """Return the nodes and edges of ``{…}`` that count: two matches differ if one of them differs."""
     nodes = {key for key, node in scope.nodes.items() if node.role != "hidden"}
     edges = frozenset(edge.key for edge in scope.edges if edge.named)
     return frozenset(nodes) | frozenset(scope.outer), edges
@@ -194,7 +194,7 @@ def frames(
     edges: frozenset[str] = frozenset(),
     columns: Iterable[Leaf] = (),
 ) -> str:
-    """Return SQL of the second phase: one row for each frame and match.
+    """Return SQL of the second phase: one row per frame and match.
 
     Parameters
     ----------
@@ -245,7 +245,7 @@ def frames(
 def _needless(
     catalog: Catalog, pairs: Iterable[PairNumber], users: frozenset[str]
 ) -> frozenset[str]:
-    """Return the tests for special pairs (such as an entity and its carrier) that no selected trace needs.
+    """Return the tests for special pairs, such as a carried entity, that no selected trace needs.
 
     An example is the height on flat roads.
     """
@@ -268,7 +268,7 @@ _USERS: Final = frozenset({*VEHICLES, "person", "animal"})
 def _kinds_of_edges(
     sql: SqlBuilder, scope: Scope, parts: Phases, needed: list[Leaf]
 ) -> dict[Leaf, str]:
-    """Return node kinds that edge rows already contain, so that no table of the node is joined: value → SQL.
+    """Return the node kinds that the rows of edges contain, so that no table of nodes is needed.
 
     The result is: expression → node.
     """
@@ -287,7 +287,7 @@ def _by_buckets(
     edges: frozenset[str],
     wanted: list[Leaf],
 ) -> str:
-    """Return SQL with one row for each match and bucket (64 frames): the number of matching frames."""
+    """Return SQL that counts frames: one row per match and bucket (64 frames), with the count."""
     select, texts = _of_buckets(sql, scope, parts, given, nodes, edges, wanted)
     texts[INVARIANT] = held(PATTERN)
     columns = {column: f"{PATTERN}.{column}" for column in columns_of(nodes, edges)}
@@ -305,7 +305,7 @@ def _of_buckets(
     edges: frozenset[str],
     wanted: Sequence[Leaf],
 ) -> tuple[Select, dict[Leaf, str]]:
-    """Return SQL of the first phase (frames as bit masks), joined with constant values of nodes.
+    """Return SQL of the first phase (frames as bit masks), joined with values of nodes that are constant.
 
     The second result is the SQL of each value.
     """
@@ -333,7 +333,7 @@ def _of_buckets(
 def in_masks(
     sql: SqlBuilder, scope: Scope, wanted: Iterable[Leaf], values: Mapping[str, str]
 ) -> str:
-    """Return SQL with the values of each match, and the frames with these values as 64-bit masks.
+    """Return SQL for the values of each match, and for the frames with these values, as 64-bit masks.
 
     Parameters
     ----------
@@ -354,7 +354,7 @@ def in_masks(
 
 
 def _lasting(sql: SqlBuilder, scope: Scope, wanted: Iterable[Leaf]) -> str | None:
-    """Return SQL with one row for each match and bucket (64 frames). ``None`` if a value can change in one."""
+    """Return SQL with one row per match and bucket (64 frames); None if a value can change in a bucket."""
     parts, wanted = phases(sql, scope), list(dict.fromkeys(wanted))
     known = sql.found_in(scope)
     if (known and not known.runs) or parts.rest or parts.late:
@@ -379,7 +379,7 @@ def _first_phase(
     ties: frozenset[str],
     needed: list[Leaf],
 ) -> tuple[Join, SharedRelation | None]:
-    """Return the first phase (bit masks), expanded to single frames, and a shared table for braces."""
+    """Return the first phase, with a row for each frame instead of bit masks; and a shared table."""
     join, nodes = Join(), bound - parts.late
     if parts.empty:
         return join, None
@@ -418,7 +418,7 @@ def _first_phase(
 def _leader(
     sql: SqlBuilder, scope: Scope, parts: Phases, nodes: frozenset[str], needed: list[Leaf]
 ) -> str | None:
-    """Return the node whose states are read first, so that no bit masks need to be expanded; or None.
+    """Return the node whose states SQL reads first, so that masks need not be expanded; or None.
 
     The states are then looked up in the few rows of the first phase, and not these rows among the many
     states. If the query selects traces, it is faster to start from the frames.
@@ -452,7 +452,7 @@ def _join_leader(sql: SqlBuilder, join: Join, scope: Scope, key: str) -> None:
 
 
 def _of_kinds(sql: SqlBuilder, scope: Scope, key: str, state: str) -> list[str]:
-    """Return SQL conditions that limit rows of ``state`` to the allowed kinds of a node.
+    """Return SQL conditions that keep only rows of ``state`` with the allowed kinds of a node.
 
     For the ego, ``is_ego`` is sufficient.
     """
@@ -466,7 +466,7 @@ def _of_kinds(sql: SqlBuilder, scope: Scope, key: str, state: str) -> list[str]:
 def _tables_of(
     sql: SqlBuilder, scope: Scope, key: str, needed: list[Leaf], *, stated: bool = False
 ) -> set[Home]:
-    """Return the tables with the needed attributes of a node. ``stated``: the state table is always used."""
+    """Return the tables that have the needed attributes of a node. ``stated`` adds the state table."""
     profile = Profile.of(scope.kinds(key), sql.catalog)
     of_it = [leaf for leaf in needed if key in _valued(leaf)]
     homes = _homes(of_it, profile)
@@ -484,7 +484,7 @@ def _second_phase(
     given: SharedRelation | None,
     needed: list[Leaf],
 ) -> None:
-    """Join all tables with needed values to the candidate frames, and set the SQL of each value."""
+    """Join the tables with needed values to the candidate frames, and store the SQL of each value."""
     needed = [leaf for leaf in needed if leaf not in join.texts]
     for key in sorted(parts.late):
         _bind_late(sql, join, scope, key)
@@ -507,7 +507,7 @@ def _second_phase(
 
 
 def _bind_late(sql: SqlBuilder, join: Join, scope: Scope, key: str) -> None:
-    """Join the states of a node that is not part of the first phase (bit masks)."""
+    """Join the states of a node that the first phase (bit masks) does not contain."""
     alias = quoted(key)
     on = [f'{alias}."frame_id" = {join.frame}'] if join.frame else []
     on += _of_kinds(sql, scope, key, alias)
@@ -519,7 +519,7 @@ def _bind_late(sql: SqlBuilder, join: Join, scope: Scope, key: str) -> None:
 
 
 def _join_rows(sql: SqlBuilder, join: Join, scope: Scope, needed: list[Leaf]) -> None:
-    """Join the rows of the frame, its trace and its map if a value needs them."""
+    """Join the tables of frames, traces and maps if a value needs them."""
     kinds = {type(leaf) for leaf in needed}
     about = {key for leaf in needed for key in _valued(leaf)}
     about |= {
@@ -546,7 +546,7 @@ def _join_rows(sql: SqlBuilder, join: Join, scope: Scope, needed: list[Leaf]) ->
 
 
 def _join_values(sql: SqlBuilder, join: Join, scope: Scope, key: str, homes: set[Home]) -> None:
-    """Join the tables that hold the needed attributes of a node."""
+    """Join the tables with the needed attributes of a node."""
     profile = Profile.of(scope.kinds(key), sql.catalog)
     at, node = join.at.get(key, Aliases()), join.nodes[key]
     state, entity, part = at.state, None, None
@@ -575,7 +575,7 @@ def _join_values(sql: SqlBuilder, join: Join, scope: Scope, key: str, homes: set
 def _value_text(  # noqa: PLR0911 - a case each
     sql: SqlBuilder, join: Join, scope: Scope, given: SharedRelation | None, leaf: Leaf
 ) -> str:
-    """Return the SQL of one value. Join the table of its edge or of its pattern in braces, if it has one."""
+    """Return the SQL of a value. If the value comes from an edge or from braces, join the table for it."""
     match leaf:
         case NodeValue(node=node):
             return join.nodes[node]
@@ -646,7 +646,7 @@ def _of_edge(sql: SqlBuilder, join: Join, scope: Scope, key: str, leaf: EdgeAttr
 
 
 def _of_ways(sql: SqlBuilder, join: Join, scope: Scope, leaf: PairNumber) -> str:
-    """Return the SQL of a number along lanes. All uses of the ego's lane distance share one join."""
+    """Return the SQL of a number along lanes. All lane distances of the ego use a single join."""
     nodes = join.nodes[leaf.a], join.nodes[leaf.b]
     kinds = [scope.kinds(key) for key in (leaf.a, leaf.b)]
     never = frozenset(SIGNALS) - sql.catalog.ego_signals
@@ -670,7 +670,7 @@ def _of_ways(sql: SqlBuilder, join: Join, scope: Scope, leaf: PairNumber) -> str
 
 
 def _of_block(sql: SqlBuilder, join: Join, given: SharedRelation | None, leaf: BlockValue) -> str:
-    """Return the SQL for the value of ``COUNT {…}`` or similar, joined by frame and outer nodes."""
+    """Return the SQL of a value such as ``COUNT {…}``, joined by frame and by nodes from outside the braces."""
     keys = frozenset(leaf.scope.outer)
     alias = f":block {leaf.number}"
     if alias not in join.lanes:  # a condition may use a block twice
@@ -716,7 +716,7 @@ _BARE: Final = {DisplayUnit.binding, DisplayUnit.owner, DisplayUnit.role, Displa
 
 
 def _valued(leaf: Leaf) -> frozenset[str]:
-    """Return the nodes whose tables must be joined before a value can be computed."""
+    """Return the nodes whose tables must be joined first to compute a value."""
     match leaf:
         case NodeAttribute(node=node, attribute=attribute):
             return frozenset() if attribute.unit in _BARE else frozenset({node})
@@ -727,7 +727,7 @@ def _valued(leaf: Leaf) -> frozenset[str]:
 
 
 def _homes(needed: list[Leaf], profile: Profile) -> set[Home]:
-    """Return the tables that hold the needed attributes of a node, and can store a node of its kinds."""
+    """Return the tables that contain the needed attributes of a node of these kinds."""
     homes: set[Home] = set()
     for leaf in needed:
         if isinstance(leaf, PairNumber):
@@ -738,7 +738,7 @@ def _homes(needed: list[Leaf], profile: Profile) -> set[Home]:
 
 
 def _of_kind(leaf: Leaf) -> bool:
-    """True if a value is the kind or the name of a node. A name consists of kind and id."""
+    """True if a value is the kind of a node, or its name (kind and id)."""
     return _is(leaf, "kind") or _is(leaf, "name")
 
 
@@ -750,7 +750,7 @@ def _join_lasting(
     catalog: Catalog,
     needed: Iterable[Leaf],
 ) -> dict[Leaf, str]:
-    """Join tables of constant node values to the first phase (bit masks). Return the SQL of each value.
+    """Join tables of constant node values to the first phase (bit masks). Return the SQL of the values.
 
     Results with only such values need no single frames. Their count is the number of frames in a mask.
     """

@@ -1,4 +1,4 @@
-"""SQL for results of matches that are computed outside the database, such as matches of a sequence."""
+"""SQL for results whose matches are computed outside the database, such as those of a sequence."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExternalRelation:
-    """Matches computed outside the database, as columns of frames, node ids and values.
+    """Matches that were computed outside the database, as columns of frames, node ids and values.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class ExternalRelation:
 
 
 def nothing(query: Query, values: int) -> ExternalRelation:
-    """Return a table of matches without rows, but with the columns of a query."""
+    """Return an empty table of matches with the columns that a query needs."""
     nodes: dict[str, list[int]] = {key: [] for key in query.scope.nodes}
     edges: dict[str, list[str]] = {edge.key: [] for edge in query.scope.edges}
     return ExternalRelation([], [], nodes, edges, [[] for _ in range(values)])
@@ -73,7 +73,7 @@ def external_matches(
     found: ExternalRelation | Callable[[Window | None], ExternalRelation],
     told: Sequence[FrameAttribute],
 ) -> SqlBuilder:
-    """Return an SQL builder for a query whose matches are computed outside the database.
+    """Return an SQL builder for a query. Its matches are computed outside the database.
 
     Its other values come from the store.
 
@@ -111,7 +111,7 @@ def external_matches(
 
 
 def _columns(found: ExternalRelation, shape: ExternalRelation) -> list[list[Any]]:
-    """Return the matches computed outside the database as a list of columns.
+    """Return a list of columns with the matches that were computed outside the database.
 
     Nodes and edges have the order of ``shape``.
     """
@@ -121,7 +121,7 @@ def _columns(found: ExternalRelation, shape: ExternalRelation) -> list[list[Any]
 
 
 def with_places(query: Query) -> tuple[Query, dict[Bound, FrameAttribute]]:
-    """Replace the values over several frames in a query's result by placeholders.
+    """Replace values that depend on several frames in the result of a query by placeholders.
 
     Return the new query and the placeholder of each value.
     """

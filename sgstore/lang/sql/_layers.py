@@ -1,4 +1,4 @@
-"""Nested SELECT statements that compute numbers of entity pairs, layer by layer, and test conditions.
+"""Nested SELECT statements: layer by layer, they compute numbers of entity pairs and test conditions.
 
 Each part of a pair number has a name in its layer and is computed once. A condition is tested in the first
 layer that has all its parts. For the expensive ``gap``, ``ttc`` and ``closing_time``, a cheap lower bound is
@@ -36,7 +36,7 @@ Part = tuple[str, str, str]
 
 
 def pairs_of(found: Iterable[Leaf]) -> list[PairNumber]:
-    """Return the numbers of entity pairs (such as ``gap``) that nested SELECT statements compute."""
+    """Return the numbers of entity pairs, such as ``gap``, that nested SELECT statements must compute."""
     return [
         leaf for leaf in found if isinstance(leaf, PairNumber) and leaf.function not in LOOKED_UP
     ]
@@ -44,7 +44,7 @@ def pairs_of(found: Iterable[Leaf]) -> list[PairNumber]:
 
 @dataclass(slots=True)
 class Join:
-    """Join of tables for the second phase (single frames), while it is built.
+    """Tables joined for the second phase (values of single frames), under construction.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ class Join:
 
 @dataclass(slots=True)
 class Layers:
-    """Nested SELECT statements around a join. They compute numbers of entity pairs and test conditions.
+    """SELECT statements nested around a join. They compute numbers of entity pairs and test conditions.
 
     Numbers that no cheap condition needs are computed after the tests of the cheap conditions.
 
@@ -119,7 +119,7 @@ class Layers:
         self.tested = max((stage_of(name, self.without) for name, _, _ in self.early), default=0)
 
     def stage(self, name: str, a: str, b: str) -> int:
-        """Return the nesting level of SELECT that computes a number of two entities; 0 for a stored column."""
+        """Return the nesting level at which SQL computes a number of two entities; 0 if it is stored."""
         if not stage_of(name):
             return 0
         part = name, a, b
@@ -129,12 +129,12 @@ class Layers:
         return self._stages[part]
 
     def stage_of_test(self, condition: Bound) -> int:
-        """Return the nesting level of SELECT after which a condition can be tested."""
+        """Return the nesting level from which SQL can test a condition."""
         pairs = pairs_of(leaves(condition))
         return max((self.stage(pair.function, pair.a, pair.b) for pair in pairs), default=0)
 
     def text(self, values: BoundValues, keys: list[str], wanted: list[Leaf]) -> str:
-        """Return the SQL of all nested SELECT statements, with columns for frame, keys and wanted values."""
+        """Return the nested SELECT statements as SQL, with columns for frame, keys and wanted values."""
         later = list(dict.fromkeys(of_later(self.needed)))
         if not later:
             return self._without_later(values, keys, wanted)
@@ -157,7 +157,7 @@ class Layers:
         return final.text()
 
     def _without_later(self, values: BoundValues, keys: list[str], wanted: list[Leaf]) -> str:
-        """Return the SQL of the nested SELECT statements, without conditions that depend on later frames."""
+        """Return the nested SELECT statements as SQL, without numbers that depend on later frames."""
         pairs = pairs_of(self.needed)
         last = max((self.stage(pair.function, pair.a, pair.b) for pair in pairs), default=0)
         innermost = self.join.select
@@ -206,7 +206,7 @@ class Layers:
         ]
 
     def _raw(self, pairs: list[PairNumber]) -> dict[str, str]:
-        """Return the stored columns that the numbers of entity pairs are computed from: name → SQL."""
+        """Return the stored columns from which SQL computes the numbers of entity pairs: name → SQL."""
         columns: dict[str, str] = {}
         for pair in pairs:
             for name in sorted(needed_for(pair.function, self.without)):
@@ -219,5 +219,5 @@ class Layers:
 
 
 def named(text: str, name: str) -> str:
-    """Return SQL for an output column with its name. ``AS`` is omitted if the column already has that name."""
+    """Return SQL for a named output column. Without need, ``AS`` is omitted."""
     return text if text == name or text.endswith(f".{name}") else f"{text} AS {name}"

@@ -1,4 +1,4 @@
-"""Queries for the matches behind the rows of a result: same order and limit, with the nodes of each match."""
+"""Queries for the matches behind the rows of a result. They return the same rows, with nodes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _ENDS: Final = {"trace": "trace", "seq": "end_seq", "time_ns": "end_ns", "t": "e
 
 
 def listed_matches(query: Query) -> Query | None:
-    """Return a query for the same rows in the same order, with the nodes of each match as columns.
+    """Return a query for the same rows in the same order, with columns for the nodes of each match.
 
     The values of ``RETURN`` are numbered (``:0 speed``), so that no name occurs twice. The matches of a
     sequence are intervals.
@@ -56,7 +56,7 @@ def listed_matches(query: Query) -> Query | None:
 
 
 def _numbered(result: Result) -> Result:
-    """Return a result with a number before the name of each column, such as ``:0 speed``."""
+    """Return a result whose columns have a number before their name, such as ``:0 speed``."""
     names = {
         column.name: f":{number} {column.name}" for number, column in enumerate(result.columns)
     }
@@ -76,7 +76,7 @@ def _numbered(result: Result) -> Result:
 
 
 def _as_intervals(result: Result, bound: tuple[ReturnColumn, ...]) -> Result:
-    """Return a result with intervals in place of rows. Its sort and sampling keys become columns."""
+    """Return a result of intervals instead of rows. Keys for sorting and sampling become columns."""
     keys = dict[Bound, str]()
 
     def named(key: Bound | str) -> str:
@@ -93,7 +93,7 @@ def _as_intervals(result: Result, bound: tuple[ReturnColumn, ...]) -> Result:
 
 
 def _with_keys(result: Result, change: Callable[[Bound | str], Bound | str]) -> Result:
-    """Return a result with a function applied to its sort keys and its sampling keys."""
+    """Return a result in which a function has replaced the keys for sorting and sampling."""
 
     def each(one: Sampling | None) -> Sampling | None:
         return one if one is None or one.per is None else replace(one, per=change(one.per))

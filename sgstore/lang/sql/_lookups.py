@@ -1,4 +1,4 @@
-"""SQL of numbers that the store looks up: lane distances, lane properties, and measures from later frames.
+"""SQL for lane distances, lane properties, and numbers from later frames, which the store contains.
 
 A node lies on stretches of lanes: an entity at one point of each of its own lanes, a light or a sign at the
 waiting places of the lanes that it controls, a part of the map at its ``map_place``.
@@ -30,14 +30,14 @@ _SIGNALS: Final = frozenset(SIGNALS)
 
 @dataclass(frozen=True, slots=True)
 class WayEnd:
-    """Start or end node of a route along lanes: the SQL column of its id, and its possible kinds."""
+    """Start or end of a route along lanes: the SQL column of a node id, and the node's possible kinds."""
 
     node: str
     kinds: Kinds
 
 
 def way_text(function: str, frame: str, ends: tuple[WayEnd, WayEnd], catalog: Catalog) -> str:
-    """Return the SQL of a number along lanes, such as a lane distance.
+    """Return the SQL of a number that is measured along lanes, such as a lane distance.
 
     The numbers are :data:`sgstore.model.pair_numbers.WAYS`.
 
@@ -68,13 +68,13 @@ _SHORTER: Final = (
 
 
 def is_between_entities(function: str, ends: tuple[WayEnd, WayEnd], catalog: Catalog) -> bool:
-    """Return True for the lane distance between two entities that are neither lights nor signs."""
+    """True for a lane distance if neither node can be a light or a sign."""
     signals = _SIGNALS & (catalog.moving | catalog.fixed | catalog.mapped)
     return function == LANE_DIST and not any(end.kinds.every & signals for end in ends)
 
 
 def lane_distances(ends: tuple[WayEnd, WayEnd], catalog: Catalog, within: list[str]) -> str:
-    """Return the SQL of all lane distances between entities: ``frame_id``, ``src``, ``dst`` and ``value``.
+    """Return SQL for all lane distances between entities: ``frame_id``, ``src``, ``dst`` and ``value``.
 
     ``within`` has conditions on the frame ids of ``":a"``.
     """
@@ -99,7 +99,7 @@ def lane_distances(ends: tuple[WayEnd, WayEnd], catalog: Catalog, within: list[s
 
 
 def _between_entities(frame: str, ends: tuple[WayEnd, WayEnd], catalog: Catalog) -> str:
-    """Return the SQL of the lane distance between two entities, each taken as a point on its lane."""
+    """Return the SQL of the lane distance of two entities. Each counts as a point on its lane."""
     a, b = (end.node for end in ends)
     conditions = _kinds_of(ends[0], ":a", catalog) + _kinds_of(ends[1], ":b", catalog)
     # Each row is joined to the given frame, not to other rows. So DuckDB starts with the frame.
@@ -118,7 +118,7 @@ def _between_entities(frame: str, ends: tuple[WayEnd, WayEnd], catalog: Catalog)
 
 
 def _between(frame: str, ends: tuple[WayEnd, WayEnd], catalog: Catalog, *, parts: bool) -> str:
-    """Return the SQL of the lane distance between two nodes that occupy stretches of lanes.
+    """Return the SQL of the lane distance of two nodes. Each covers parts of lanes.
 
     It is 0 if they overlap.
     """
@@ -137,7 +137,7 @@ def _between(frame: str, ends: tuple[WayEnd, WayEnd], catalog: Catalog, *, parts
 
 
 def _next_text(frame: str, end: WayEnd, what: str, catalog: Catalog) -> str:
-    """Return the SQL of the distance along lanes to the next map part of a kind, such as a junction.
+    """Return the SQL of the distance along lanes to the next part of the map, such as a junction.
 
     It is 0 inside the part.
     """
@@ -156,7 +156,7 @@ def _next_text(frame: str, end: WayEnd, what: str, catalog: Catalog) -> str:
 
 
 def _course_text(frame: str, end: WayEnd, column: str, catalog: Catalog) -> str:
-    """Return the SQL of the curvature or slope of the primary lane at the place of an entity."""
+    """Return the SQL of the curvature or slope of an entity's primary lane at its position."""
     more = "".join(f" AND {one}" for one in _kinds_of(end, ":s", catalog))
     return f"""(
     SELECT min(":c"."{column}")
@@ -169,7 +169,7 @@ def _course_text(frame: str, end: WayEnd, column: str, catalog: Catalog) -> str:
 
 
 def told_lanes(what: str) -> str:
-    """Return SQL for the traces whose map has data on ``ways``, ``curvature`` or ``slope`` of lanes."""
+    """Return SQL for the traces whose map has values for ``ways``, ``curvature`` or ``slope`` of lanes."""
     known = "" if what == "ways" else f' AND ":c"."{what}" IS NOT NULL'
     table = "map_reach" if what == "ways" else "map_course"
     return (
@@ -179,7 +179,7 @@ def told_lanes(what: str) -> str:
 
 
 def _stretches(frame: str, end: WayEnd, catalog: Catalog, *, parts: bool) -> str:
-    """Return SQL for the stretches of lanes that a node occupies: lane, start and end; m."""
+    """Return SQL for the parts of lanes that a node covers: lane, start and end; m."""
     kinds, held = end.kinds.every, catalog.moving | catalog.fixed
     found: list[str] = []
     if kinds & entity_kinds() - _SIGNALS:
@@ -206,7 +206,7 @@ def _stretches(frame: str, end: WayEnd, catalog: Catalog, *, parts: bool) -> str
 
 
 def _controlled(frame: str, node: str, kinds: frozenset[str], edges: str) -> str:
-    """Return SQL for the points on lanes where traffic waits at a light or sign.
+    """Return SQL for the points on lanes where vehicles wait at a light or sign.
 
     They come from the map, otherwise from the junction.
     """
@@ -222,7 +222,7 @@ def _controlled(frame: str, node: str, kinds: frozenset[str], edges: str) -> str
 
 
 def _kinds_of(end: WayEnd, alias: str, catalog: Catalog) -> list[str]:
-    """Return SQL conditions on the kind in ``lane_state`` rows. They reduce the number of rows to read."""
+    """Return SQL conditions on the kinds of entities. With them, fewer rows of ``lane_state`` are read."""
     kinds = end.kinds.only(entity_kinds() - _SIGNALS)
     held = catalog.moving | catalog.fixed
     return kind_conditions(kinds, f'"{alias}"."kind"', f'"{alias}"."is_ego"', held)
@@ -233,12 +233,12 @@ LOOKED_UP: Final = WAYS | RECORDED.keys()
 
 
 def of_later(found: Iterable[Leaf]) -> list[PairNumber]:
-    """Return the pair numbers that use later frames. They are evaluated last because they are expensive."""
+    """Return the numbers of entity pairs that use later frames. SQL computes them last, as they are slow."""
     return [leaf for leaf in found if isinstance(leaf, PairNumber) and leaf.function in RECORDED]
 
 
 def recorded_text(value: PairNumber, *, world: bool) -> str:
-    """Return the SQL call for a number of two entities that uses later frames.
+    """Return the SQL of a number of two entities that uses later frames.
 
     The store defines the SQL function.
     """

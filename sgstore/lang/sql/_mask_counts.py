@@ -31,7 +31,7 @@ _TOPS: Final = _ONES << (WIDTH - 1)
 
 @dataclass(frozen=True, slots=True)
 class CountRange:
-    """Range of counts that a comparison such as ``COUNT {…} > 2`` accepts.
+    """Range of counts: those for which a comparison such as ``COUNT {…} > 2`` is true.
 
     Counts are at least ``least`` and less than ``end``.
     """
@@ -41,7 +41,7 @@ class CountRange:
 
     @classmethod
     def of(cls, sign: str, number: float) -> CountRange:
-        """Return the range of counts from 1 for which ``count sign number`` is true.
+        """Return the range of counts (from 1 up) for which ``count sign number`` is true.
 
         The comparison must be false for 0.
         """
@@ -68,13 +68,13 @@ class CountRange:
         return self.end is not None and self.least >= self.end
 
     def condition(self, count: str) -> str:
-        """Return the SQL condition that a count is in the range."""
+        """Return the SQL condition: a count is in the range."""
         least = f"{count} >= {self.least}"
         return least if self.end is None else f"{least} AND {count} < {self.end}"
 
 
 def frames_with(rows: str, keys: list[str], wanted: CountRange) -> str:
-    """Return SQL for the frames whose number of rows is in a range, as 64-bit masks of frames.
+    """Return SQL for the frames whose row count is in a range, as 64-bit masks of frames.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def frames_with(rows: str, keys: list[str], wanted: CountRange) -> str:
 
 
 def _summed(rows: str, keys: list[str], wanted: CountRange) -> str:
-    """Return SQL that counts rows per frame by adding 64-bit masks, for buckets (64 frames) with few rows."""
+    """Return SQL that counts rows per frame with sums of masks, for buckets (64 frames) with few rows."""
     sums = [
         f'CAST(sum(("mask" >> {shift}) & {_ONES}) AS BIGINT) AS {_sum(shift)}'
         for shift in range(WIDTH)
@@ -116,7 +116,7 @@ def _sum(shift: int) -> str:
 
 
 def _reached(bound: int) -> str:
-    """Return SQL for the 64-bit mask of the frames whose row count is at least ``bound``."""
+    """Return SQL for a 64-bit mask of the frames with at least ``bound`` rows."""
     less = bound * _ONES
     parts = [
         f"((({_sum(shift)} | {_TOPS}) - {less}) & {_TOPS}) >> {WIDTH - 1 - shift}"

@@ -54,13 +54,13 @@ _BIT: Final = '"bit"'
 
 
 def bit_of(frame: str) -> str:
-    """Return SQL for the 64-bit mask with the bit of a single frame."""
+    """Return SQL for a 64-bit mask in which only the bit of one frame is set."""
     number = frame if frame.endswith(_BIT) else f"{frame} & 63"
     return f"CAST(1 AS BIGINT) << CAST({number} AS INTEGER)"
 
 
 def folded(text: str, keys: list[str]) -> str:
-    """Return SQL that groups rows of single frames into rows of buckets (64 frames) with bit masks."""
+    """Return SQL that converts rows of single frames to bit masks: one row per bucket (64 frames)."""
     bit = bit_of('"frame_id"')
     select = Select(['"frame_id" >> 6 AS "bucket"', *keys, f'bit_or({bit}) AS "mask"'])
     select.join(nested(text, ":frames"), [])
@@ -69,7 +69,7 @@ def folded(text: str, keys: list[str]) -> str:
 
 
 def merged(text: str, values: Mapping[str, str]) -> str:
-    """Return SQL that merges rows with equal bucket (64 frames) and values: their bit masks are joined by OR.
+    """Return SQL that merges the bit masks of rows with equal bucket (64 frames) and equal values.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ _BRANCHES: Final = 8
 
 @dataclass(slots=True)
 class Base:
-    """Join of tables for the first phase (frames as bit masks), while it is built.
+    """Tables joined for the first phase (frames as bit masks), under construction.
 
     Attributes
     ----------
@@ -147,7 +147,7 @@ class Base:
     def join(
         self, table: str, alias: str, ends: Mapping[str, str], conditions: Iterable[str] = ()
     ) -> None:
-        """Join a table of bit masks on the bucket (64 frames) and on nodes that are joined already.
+        """Join a table of bit masks on the bucket (64 frames), and on the nodes that are joined already.
 
         ``ends`` are its node columns.
         """
@@ -158,7 +158,7 @@ class Base:
         self.tie(table, ends, [*conditions, *on])
 
     def tie(self, table: str, ends: Mapping[str, str], conditions: Iterable[str]) -> None:
-        """Join a table on the nodes that are joined already. ``ends`` are its node columns."""
+        """Join a table on the nodes that are joined already. ``ends`` are the table's node columns."""
         on = list(conditions)
         for key, column in ends.items():
             if key in self.nodes:
@@ -168,7 +168,7 @@ class Base:
         self.select.join(table, on)
 
     def need_bucket(self) -> None:
-        """Join the table ``bucket`` (groups of 64 frames, with their map), unless it is joined already."""
+        """Join the table ``bucket`` (map of each 64 frames), unless it is part of the join already."""
         if not self.knows_map:
             self.knows_map = True
             on = [f'{BUCKET}."bucket" = {self.bucket}'] if self.bucket else []
@@ -178,7 +178,7 @@ class Base:
 
 @dataclass(slots=True)
 class SqlBuilder:
-    """Builder of the SQL of one query, with its bound values and shared subqueries.
+    """Builder of the SQL of one query, with its parameter values and shared subqueries.
 
     Attributes
     ----------
@@ -206,23 +206,23 @@ class SqlBuilder:
 
     @property
     def standing(self) -> frozenset[str]:
-        """Kinds of node whose presence is stored as bit masks: static entities and map parts."""
+        """Kinds of node whose presence the store has as bit masks: static entities and map parts."""
         return self.catalog.fixed | self.catalog.mapped
 
     def edges_of(self, edge: Edge) -> str:
-        """Return the table with the rows of an edge: all known edges, or only edges of scene graphs."""
+        """Return the table with the rows of an edge: ``known_edge`` has all edges, ``edge`` those of graphs."""
         return '"known_edge"' if self.catalog.world and edge.known else '"edge"'
 
     def nodes_of(self, edge: Edge) -> str:
-        """Return the table with the presence of static nodes that limits the two nodes of a map edge."""
+        """Return the table of static nodes that limits an edge of the map to frames with both nodes."""
         return '"graph_node"' if self.catalog.world and not edge.known else '"node"'
 
     def found_in(self, scope: Scope) -> SharedRelation | None:
-        """Return the matches of a pattern that were computed outside the database, or None."""
+        """If the matches of a pattern were computed outside the database, return them; otherwise None."""
         return self.found if scope is self.query.scope else None
 
     def within(self, column: str, per: int = 1, *, met: bool = False) -> list[str]:
-        """Return SQL conditions that limit a column of frame or bucket numbers to the time window.
+        """Return SQL conditions that keep only frames (or buckets of 64 frames) in the time window.
 
         It holds buckets of 64 frames, or frames if ``per`` is 64.
 
@@ -239,13 +239,13 @@ class SqlBuilder:
         return found
 
     def share(self, text: str, name: str) -> str:
-        """Add a subquery that several parts of the statement use, and return its name."""
+        """Add a subquery for several parts of the statement, and return its name."""
         full = f"{name} {len(self.shared) + 1}"
         self.shared.append((full, text))
         return full
 
     def of_traces(self, trace: str, scope: Scope) -> list[str]:
-        """Return SQL conditions that limit the main pattern to the selected traces."""
+        """Return SQL conditions that keep only the selected traces in the main pattern."""
         if scope is not self.query.scope:
             return []
         chosen, left = traces_of(self.query, self.catalog)
@@ -257,12 +257,12 @@ class SqlBuilder:
 
 
 def if_bound(sql: SqlBuilder, node: str, value: str) -> str:
-    """Return SQL for a value that becomes NULL if its optional node is missing."""
+    """Return the SQL of a value. It becomes NULL if its node is optional and missing."""
     return f"CASE WHEN {node} IS NOT NULL THEN {value} END" if sql.query.stages else value
 
 
 def expanded(text: str, nodes: frozenset[str], edges: frozenset[str], kinds: frozenset[str]) -> str:
-    """Return SQL that expands rows with bit masks to one row for each frame.
+    """Return SQL that converts rows with bit masks to one row per frame.
 
     It includes the kinds of some nodes.
     """
@@ -275,25 +275,25 @@ def expanded(text: str, nodes: frozenset[str], edges: frozenset[str], kinds: fro
 
 
 def in_mask(alias: str, frame: str) -> str:
-    """Return the SQL condition that the bit of a frame is set in the mask of a row."""
+    """Return the SQL condition: the mask of a row has the bit of a frame."""
     return f'({alias}."mask" & ({bit_of(frame)})) <> 0'
 
 
 def stands_text(frame: str, node: str) -> str:
-    """Return the SQL condition that a static node is in the scene graph of a frame."""
+    """Return the SQL condition: the scene graph of a frame contains a static node."""
     on = [f'":g"."bucket" = {frame} >> 6', f'":g"."node_id" = {node}', in_mask('":g"', frame)]
     rows = Select(["1"], ['"graph_node" AS ":g"'], on)
     return f"EXISTS ({rows.text()})"
 
 
 def number_of_frames(text: str) -> str:
-    """Return SQL that counts the frames in the bit masks of a subquery."""
+    """Return SQL that counts the frames in all bit masks of a subquery."""
     total = 'coalesce(sum(bit_count("mask")), 0) AS "frames"'
     return Select([total], [nested(text, ":pattern")]).text()
 
 
 def found_masks(found: SharedRelation) -> str:
-    """Return SQL that converts runs of frames (first, last) to bit masks.
+    """Return SQL that converts series of frames (first, last) to bit masks.
 
     Each run is within a bucket of 64 frames.
     """
@@ -305,12 +305,12 @@ def found_masks(found: SharedRelation) -> str:
 
 
 def in_which(alias: str) -> list[str]:
-    """Return the SQL columns that identify the frames of a row: bucket (64 frames) and bit mask."""
+    """Return the SQL columns with the frames of a row: bucket (64 frames) and bit mask."""
     return [f'{alias}."bucket"', f'{alias}."mask"']
 
 
 def held(alias: str) -> str:
-    """Return the SQL expression for the number of frames in the bit mask of a row."""
+    """Return the SQL that counts the frames in the bit mask of a row."""
     return f'bit_count({alias}."mask")'
 
 
@@ -320,7 +320,7 @@ def with_blocks(
     nodes: frozenset[str],
     edges: frozenset[str],
 ) -> str:
-    """Return SQL that limits bit masks to the frames in which ``EXISTS {…}`` conditions hold, or do not hold.
+    """Return SQL that keeps only the frames in which ``EXISTS {…}`` conditions have the wanted value.
 
     Parameters
     ----------
@@ -356,7 +356,7 @@ def base_rows(
     edges: frozenset[str],
     kinds: frozenset[str] = frozenset(),
 ) -> str:
-    """Return SQL that joins the nodes and edges of a pattern: one row for each match and bucket (64 frames)."""
+    """Return SQL that joins nodes and edges of a pattern: one row per match and bucket (64 frames)."""
     unfolded = _unfolded(sql, scope, parts, given, nodes, edges)
     if unfolded:
         return unfolded
@@ -397,7 +397,7 @@ def base_rows(
 
 
 def _from_ego(sql: SqlBuilder, scope: Scope, base: Base) -> tuple[tuple[Edge, ...], range]:
-    """Return the edges in join order, and the numbers of edges after which the rows become a new subquery.
+    """Return the edges in the order of joining, and the edges after which a new subquery begins.
 
     The database misjudges joins of many tables of masks. So the few rows of the ego, or of the outer pattern,
     come first, and each step begins with a table of the rows found so far.
@@ -418,7 +418,7 @@ def _from_ego(sql: SqlBuilder, scope: Scope, base: Base) -> tuple[tuple[Edge, ..
 def _join_tests(
     sql: SqlBuilder, base: Base, scope: Scope, nodes: set[str], single: dict[str, list[Bound]]
 ) -> None:
-    """Join the presence and the conditions of nodes. Each condition is removed from ``single``."""
+    """Join tables that test the presence and the conditions of nodes. Remove them from ``single``."""
     for key in scope.nodes:
         if key in nodes and key not in base.present:
             _join_presence(sql, base, key, scope.kinds(key), single.pop(key, []))
@@ -427,7 +427,7 @@ def _join_tests(
 
 
 def _begin_anew(sql: SqlBuilder, base: Base, scope: Scope) -> None:
-    """Put the current join into a shared table, and start a new join with that table."""
+    """Make the current join a shared subquery, and start a new join from it."""
     base.need_bucket()
     base.select.where += [*_differences(base, scope), *sql.within(base.bucket)]
     keep = {"map_id": f'{BUCKET}."map_id"'}
@@ -449,14 +449,14 @@ def _begin_anew(sql: SqlBuilder, base: Base, scope: Scope) -> None:
 
 
 def _differences(base: Base, scope: Scope) -> list[str]:
-    """Return SQL conditions that nodes differ, for nodes that the earlier steps did not compare."""
+    """Return the SQL conditions "these nodes differ" that earlier steps did not test."""
     bound = set(base.nodes)
     pairs = apart(scope, bound, bound - base.apart)
     return [f"{base.nodes[a]} <> {base.nodes[b]}" for a, b in pairs]
 
 
 def _common(base: Base) -> str:
-    """Return the SQL of the common bits of all masks of a join. Exclude rows without common bits."""
+    """Return the SQL of the bits that all masks of a join have in common. Exclude rows without such bits."""
     mask = " & ".join(base.masks)
     if len(base.masks) <= _MANY:
         base.select.where += [f"({a} & {b}) <> 0" for a, b in combinations(base.masks, 2)]
@@ -466,7 +466,7 @@ def _common(base: Base) -> str:
 
 
 def _join_given(sql: SqlBuilder, base: Base, scope: Scope, given: SharedRelation) -> None:
-    """Join the rows of the outer pattern, for a pattern in braces."""
+    """Add the rows of the outer pattern to the SQL of a pattern in braces."""
     columns = columns_of(frozenset(scope.outer))
     table = f"{quoted(given.name)} AS {OUTSIDE}"
     if given.edges or given.nodes != frozenset(scope.outer):
@@ -517,7 +517,7 @@ def _join_edge(sql: SqlBuilder, base: Base, scope: Scope, edge: Edge) -> None:
 
 
 def _join_graph_nodes(sql: SqlBuilder, base: Base, edge: Edge, ends: Mapping[str, str]) -> None:
-    """Limit the frames to those in which both nodes of an edge are in the scene graph."""
+    """Keep only the frames in which both nodes of an edge are in the scene graph."""
     if sql.nodes_of(edge) == '"node"':
         return
     for key in ends:
@@ -526,7 +526,7 @@ def _join_graph_nodes(sql: SqlBuilder, base: Base, edge: Edge, ends: Mapping[str
 
 
 def _join_alone(sql: SqlBuilder, base: Base, scope: Scope, block: BlockValue) -> None:
-    """Join an ``EXISTS {…}`` as a separate subquery: frames with a match, and ids of the outer nodes."""
+    """Join an ``EXISTS {…}`` as a subquery: its frames, and the ids of its nodes from outside the braces."""
     outer = {key: kinds & scope.kinds(key) for key, kinds in block.scope.outer.items()}
     inner = replace(block.scope, outer=outer)
     keys, alias = frozenset(outer), quoted(f":alone {block.number}")
@@ -540,7 +540,7 @@ def _join_alone(sql: SqlBuilder, base: Base, scope: Scope, block: BlockValue) ->
 
 
 def _join_happened(sql: SqlBuilder, base: Base, happened: Happened, name: str) -> None:
-    """Join the frames of a recorded event with the ids of its nodes.
+    """Join the frames of a recorded event, with the ids of the nodes that it involves.
 
     Presence of the nodes is tested separately.
     """
@@ -555,7 +555,7 @@ def _join_happened(sql: SqlBuilder, base: Base, happened: Happened, name: str) -
 
 
 def told_kinds(sql: SqlBuilder, scope: Scope, parts: Phases) -> frozenset[str]:
-    """Return the nodes whose kind can be read from the rows of an edge."""
+    """Return the nodes whose kind is in the rows of an edge."""
     if parts.blocks or any(edge.high > 1 for edge in scope.edges):
         return frozenset()
     found = set[str]()
@@ -568,7 +568,7 @@ def told_kinds(sql: SqlBuilder, scope: Scope, parts: Phases) -> frozenset[str]:
 
 
 def _rows(sql: SqlBuilder, scope: Scope, edge: Edge, *, moving: bool, lasting: bool) -> str:
-    """Return SQL for the rows of an edge that is undirected, or stored in tables of both frames and maps."""
+    """Return SQL for the rows of an edge that is undirected, or in a table of frames and one of maps."""
     directions = (False, True) if edge.both else (False,)
     branches: list[str] = []
     for swapped in directions:
@@ -586,7 +586,7 @@ def _rows(sql: SqlBuilder, scope: Scope, edge: Edge, *, moving: bool, lasting: b
 
 
 def _lasting_rows(sql: SqlBuilder, scope: Scope, edge: Edge, *, swapped: bool) -> str:
-    """Return SQL for map edges, with bit masks of the frames in which both nodes are present."""
+    """Return SQL for edges of the map. Bit masks mark the frames in which both nodes are present."""
     mask = '"p"."mask" & "q"."mask"'
     select = Select(_row_columns('"m"', mask, swapped=swapped))
     select.columns[0] = '"p"."bucket" AS "bucket"'
@@ -610,7 +610,7 @@ def _unfolded(
     nodes: frozenset[str],
     edges: frozenset[str],
 ) -> str:
-    """Return SQL with one join for each combination of path lengths, or an empty text if unsuitable.
+    """Return SQL with one join per combination of path lengths; an empty text if this is not useful.
 
     Then the search for a path begins at nodes that other edges bind.
     """
@@ -637,7 +637,7 @@ def _unfolded(
 
 
 def _chains(sql: SqlBuilder, scope: Scope, edge: Edge) -> list[Scope]:
-    """Return a path of variable length as patterns of single edges, one for each possible length."""
+    """Return patterns that replace a path of variable length: one for each length, with single edges."""
     nodes = {key: Node(key, scope.kinds(key), "hidden", edge.span) for key in (edge.src, edge.dst)}
     single = replace(edge, low=1, high=1)
     alone = Scope(nodes, {}, (single,), (), frozenset())
@@ -650,7 +650,7 @@ def _chains(sql: SqlBuilder, scope: Scope, edge: Edge) -> list[Scope]:
 
 
 def _ways(sql: SqlBuilder, scope: Scope, edge: Edge) -> str:
-    """Return SQL for the routes of a path along map edges, or an empty text if it can use edges of frames.
+    """Return SQL for the routes of a path along edges of the map; an empty text if other edges occur.
 
     Their number does not depend on the number of frames. Other edges are joined to these routes. Then the
     presence of the inner nodes is tested.
@@ -668,7 +668,7 @@ def _ways(sql: SqlBuilder, scope: Scope, edge: Edge) -> str:
 
 
 def _ways_along(sql: SqlBuilder, scope: Scope, path: Edge) -> str:
-    """Return SQL for the routes along a chain of map edges of fixed length."""
+    """Return SQL for the routes along a fixed number of edges of the map."""
     base, first = Base(), f'{quoted(alias_of(scope.edges[0]))}."map_id"'
     for edge in scope.edges:
         alias = quoted(alias_of(edge))
@@ -688,7 +688,7 @@ def _ways_along(sql: SqlBuilder, scope: Scope, path: Edge) -> str:
 
 
 def _paths(sql: SqlBuilder, scope: Scope, edge: Edge) -> str:
-    """Return SQL for a path of several edges: ids of its two end nodes, with its frames as bit masks."""
+    """Return SQL for a path of several edges: ids of both end nodes, and its frames as bit masks."""
     ends = ((edge.src, "src"), (edge.dst, "dst"))
     keys = frozenset((edge.src, edge.dst))
     branches: list[str] = []
@@ -706,7 +706,7 @@ def _paths(sql: SqlBuilder, scope: Scope, edge: Edge) -> str:
 def _join_presence(
     sql: SqlBuilder, base: Base, key: str, kinds: Kinds, conditions: list[Bound]
 ) -> None:
-    """Join the bit masks of the frames in which a node is present and meets its conditions."""
+    """Join bit masks of the frames in which a node is present and meets its conditions."""
     alias = quoted(f"{key}:")
     profile = Profile.of(kinds, sql.catalog)
     if profile.moving or conditions:
@@ -718,7 +718,7 @@ def _join_presence(
 
 
 def _kinds_to_test(scope: Scope, key: str) -> Kinds:
-    """Return the kinds of a node to test in its states. An ego at the end of an edge needs no test."""
+    """Return the node kinds that SQL must test in the states. For an ego at an edge, kinds are known."""
     kinds = scope.kinds(key)
     said = any(edge.high == 1 and key in {edge.src, edge.dst} for edge in scope.edges)
     return ego_kinds() if said and kinds.one_a_frame else kinds
@@ -727,7 +727,7 @@ def _kinds_to_test(scope: Scope, key: str) -> Kinds:
 def _join_conditions(
     sql: SqlBuilder, base: Base, key: str, kinds: Kinds, conditions: list[Bound]
 ) -> None:
-    """Join the bit masks of the frames in which a present node meets its conditions."""
+    """Join bit masks of the frames in which a node meets its conditions. Its presence is known."""
     profile, alias = Profile.of(kinds, sql.catalog), quoted(f"{key}:")
     constant = all(is_constant(leaf) for c in conditions for leaf in leaves(c))
     if profile.mapped and profile.places == 1:
@@ -753,7 +753,7 @@ def _join_lane(
     conditions: list[Bound],
     of_lane: list[Bound],
 ) -> None:
-    """Join the bit masks of the frames in which an edge meets the conditions on its attributes and its lane.
+    """Join bit masks of the frames in which an edge meets the conditions on itself and on its lane.
 
     The kinds of its entity, and the conditions ``of_lane`` if the lane is read anyway, are tested here too,
     because the table has a row for each entity, lane and frame.
@@ -796,7 +796,7 @@ def _join_lane(
 
 
 def stored_rows(catalog: Catalog, view: str, alias: str) -> dict[str, str]:
-    """Return the tables behind a view of edge attributes: table → SQL of the bit mask of a row.
+    """Return the tables behind a view of edge attributes: table → SQL of a row's bit mask.
 
     The view has a row for each frame. A table has one row for many frames with equal values.
     """
@@ -808,7 +808,7 @@ def stored_rows(catalog: Catalog, view: str, alias: str) -> dict[str, str]:
 
 
 def _present(sql: SqlBuilder, kinds: Kinds, profile: Profile, conditions: list[Bound]) -> str:
-    """Return SQL for the frames in which nodes are present and meet conditions, as bit masks.
+    """Return SQL for nodes that are present and meet conditions, with their frames as bit masks.
 
     It has one part for each table.
     """
@@ -882,7 +882,7 @@ def _standing(sql: SqlBuilder, kinds: Kinds, conditions: list[Bound], place: str
 
 
 def _join_trace(sql: SqlBuilder, select: Select, trace: str, conditions: list[Bound]) -> str | None:
-    """Join the table ``trace`` if a condition uses a position. Return its alias, or None."""
+    """If a condition uses a position, join the table ``trace`` and return its alias; otherwise None."""
     if not any(is_position(leaf) for c in conditions for leaf in leaves(c)):
         return None
     select.join('"trace" AS "t"', [f'"t"."trace_id" = {trace}'])
@@ -890,7 +890,7 @@ def _join_trace(sql: SqlBuilder, select: Select, trace: str, conditions: list[Bo
 
 
 def _masked(sql: SqlBuilder, base: Base, keep: Mapping[str, str]) -> str:
-    """Return SQL that combines the bit masks of a join, with the given columns and without duplicates."""
+    """Return SQL for a join with its bit masks combined, the given columns, and no duplicates."""
     select, mask = base.select, _common(base)
     named = [f"{column} AS {name}" for name, column in keep.items()]
     select.columns = [f'{base.bucket} AS "bucket"', *named, f'{mask} AS "mask"']
@@ -905,7 +905,7 @@ def _masked(sql: SqlBuilder, base: Base, keep: Mapping[str, str]) -> str:
 def _on_the_way(
     sql: SqlBuilder, join: Select, stops: list[tuple[str, str]], keys: list[str]
 ) -> str:
-    """Return SQL that limits a join to the frames in which the inner nodes of paths are present."""
+    """Return SQL that keeps only the frames of a join in which the inner nodes of paths are present."""
     names = [f"stop {number}" for number in range(1, len(stops) + 1)]
     tables = {name: table for name, (_, table) in zip(names, stops, strict=True)}
     join.columns += [

@@ -1,4 +1,4 @@
-"""Owners of node ids: the trace of an entity, or the map of a map part. Ids are unique only for one owner.
+"""Owners of node ids: a trace for an entity, a map for a map part. Two owners may use the same id.
 
 A node id is unique within a trace, or, if negative, within a map. So an entity is identified by trace and id,
 a part of a map by map and id. Traces may share a map.
@@ -45,12 +45,12 @@ traces may share a map. Queries cannot use this attribute."""
 
 
 def owner_of(node: str) -> NodeAttribute:
-    """Return the query expression for the owner (trace or map) of a node."""
+    """Return the query expression for the owner of a node, which is a trace or a map."""
     return NodeAttribute(node, OWNER, Type.number)
 
 
 def owners_of(values: Iterable[Bound], query: Query, catalog: Catalog) -> list[NodeAttribute]:
-    """Return the owner (trace or map) of each returned node, for results in which node ids are ambiguous.
+    """Return the owners (trace or map) of the returned nodes, if ids alone do not identify the nodes.
 
     Empty if only one trace is searched, or if a value identifies the trace.
     """
@@ -61,7 +61,7 @@ def owners_of(values: Iterable[Bound], query: Query, catalog: Catalog) -> list[N
 
 
 def with_owners(result: Result) -> Result:
-    """Return a result clause with extra columns for the owner (trace or map) of each node.
+    """Return a result with one more column for each node: its owner, which is a trace or a map.
 
     Rows with a frame need no such columns.
     """
@@ -76,7 +76,7 @@ def with_owners(result: Result) -> Result:
 
 
 def counted_apart(query: Query, catalog: Catalog) -> Query:
-    """Return a query in which ``COUNT(DISTINCT v)`` counts nodes separately for each trace or map."""
+    """Return a query in which ``COUNT(DISTINCT v)`` counts equal ids of different traces separately."""
     keys = [column.value for column in query.result.columns]
     if _tells_trace(keys) or not _several(query, catalog):
         return query

@@ -1,4 +1,4 @@
-"""Query plan: sorts conditions into SQL phases (bit masks first, then single frames).
+"""Query plan: sorts conditions into the two SQL phases, bit masks and single frames.
 
 The first phase works on bit masks, the second on single frames. A node that only the second phase needs is
 bound there.
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Gathered:
-    """Temporary table with matches that were computed outside the database.
+    """Temporary table of matches that were computed outside the database.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class Gathered:
 
 @dataclass(frozen=True, slots=True)
 class SharedRelation:
-    """Subquery that several parts of an SQL statement use: bit masks of frames, or computed matches.
+    """Shared subquery of an SQL statement. It has bit masks of frames, or computed matches.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ class SharedRelation:
     runs: bool = False
 
     def frames(self, alias: str) -> str:
-        """Return the subquery as text for ``FROM``, with one row for each frame."""
+        """Return the subquery as text for ``FROM``, with one row per frame."""
         if not self.runs:
             return f"{quoted(self.name)} AS {quoted(alias)}"
         every = ['unnest(range("first", "last" + 1)) AS "frame_id"', '* EXCLUDE ("first", "last")']
@@ -89,7 +89,7 @@ class SharedRelation:
 
 @dataclass(slots=True)
 class Phases:
-    """Conditions of a graph pattern, grouped by the SQL that evaluates them.
+    """Conditions of a graph pattern, grouped by the part of the SQL that tests them.
 
     Attributes
     ----------
@@ -128,7 +128,7 @@ class Phases:
 
 
 def phases_of(scope: Scope, query: Query, catalog: Catalog) -> Phases:
-    """Group the conditions of a graph pattern by the SQL phase that evaluates them."""
+    """Group the conditions of a graph pattern by the SQL phase that tests them."""
     parts = Phases()
     for condition in scope.where:
         if stands_alone(condition, catalog):
@@ -195,7 +195,7 @@ def _is_direct(leaf: Leaf) -> bool:
 
 
 def _edge_alone(found: set[Leaf], scope: Scope, catalog: Catalog) -> str | None:
-    """Return the only edge that a condition uses, if it uses nothing but this edge and its lane; or None."""
+    """If a condition uses only one edge and its lane, return the key of this edge; otherwise None."""
     edges = {leaf.edge for leaf in found if isinstance(leaf, EdgeAttribute)}
     if len(edges) != 1:
         return None
@@ -215,7 +215,7 @@ def _edge_alone(found: set[Leaf], scope: Scope, catalog: Catalog) -> str | None:
 
 
 def _of_null(condition: Bound) -> bool:
-    """True if a condition can be true for a missing row, such as ``IS NULL`` for an edge without attributes."""
+    """True if a condition may be true where a row is missing: it contains ``IS NULL`` or similar."""
     return any(
         isinstance(part, Operation) and part.word in {"IS NULL", "IS NOT NULL", "coalesce", "case"}
         for part in walk(condition)
@@ -223,7 +223,7 @@ def _of_null(condition: Bound) -> bool:
 
 
 def _late(scope: Scope, parts: Phases, query: Query, catalog: Catalog) -> Iterator[str]:
-    """Yield nodes to join in the second phase (single frames): nodes with values, but without edges or braces.
+    """Yield nodes that only the second phase (single frames) joins. They have no edges.
 
     Otherwise, all states would be grouped into masks and then expanded again.
     """
@@ -246,7 +246,7 @@ def _late(scope: Scope, parts: Phases, query: Query, catalog: Catalog) -> Iterat
 
 
 def blocked(query: Query) -> frozenset[str]:
-    """Return the outer nodes that patterns in braces use, anywhere in a query."""
+    """Return the nodes from outside the braces that patterns in braces of a query use."""
     return frozenset(_blocked((*query.scope.where, *query.result.values)))
 
 
@@ -258,7 +258,7 @@ def _blocked(expressions: tuple[Bound, ...]) -> Iterator[str]:
 
 
 def traces_of(query: Query, catalog: Catalog) -> tuple[set[int] | None, set[int]]:
-    """Return the ids of the selected traces (None means all), and of traces that lack data for the query."""
+    """Return the ids of the selected traces (None for all), and of the traces that lack needed data."""
     chosen = None
     if query.ego is not None:
         chosen = {trace.trace_id for trace in catalog.traces if trace.ego == query.ego}
@@ -272,7 +272,7 @@ def traces_of(query: Query, catalog: Catalog) -> tuple[set[int] | None, set[int]
 
 
 def apart(scope: Scope, nodes: set[str], new: set[str]) -> Iterator[tuple[str, str]]:
-    """Yield the pairs of nodes that must differ, if at least one node of the pair is new in this join.
+    """Yield the pairs of nodes that must differ, for pairs with a node that this join adds.
 
     Pairs with disjoint kinds differ anyway and are omitted.
     """

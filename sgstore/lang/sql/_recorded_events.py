@@ -1,4 +1,4 @@
-"""SQL of the condition ``HAPPENS name(…)``: true if the recording has this event in the frame."""
+"""SQL of ``HAPPENS name(…)``, which is true if the frame has this recorded event."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def happened_rows(happened: Happened) -> str:
-    """Return SQL for the frames of a recorded event. Columns ``:0`` and ``:1`` are the nodes involved."""
+    """Return SQL for the frames of a recorded event, with its nodes in the columns ``:0`` and ``:1``."""
     if happened.table:
         return _rows_of_table(happened)
     told, ends = [literal(happened.kind)], ('"node_id"', '"other"')
@@ -44,7 +44,7 @@ def _rows_of_table(happened: Happened) -> str:
 
 
 def happened_text(happened: Happened, frame: str, nodes: Sequence[str]) -> str:
-    """Return SQL that is true if a recorded event in a frame involves some nodes.
+    """Return SQL that is true if a frame has a recorded event that involves the given nodes.
 
     NULL means that the trace does not record such events.
     """
@@ -58,7 +58,7 @@ def happened_text(happened: Happened, frame: str, nodes: Sequence[str]) -> str:
 
 
 def happened_in_frame(happened: Happened) -> str:
-    """Return SQL for the nodes of a recorded event in one frame: two columns, padded with NULL."""
+    """Return SQL for the nodes of a recorded event in one frame: two columns, NULL for a missing node."""
     told = [f'":{place}"' for place in range(len(happened.nodes))]
     columns = [*told, "NULL", "NULL"][:2]
     rows = nested(happened_rows(happened), ":e")
@@ -86,6 +86,6 @@ def told_events(kind: str) -> str:
 
 
 def recorded_events(schemas: Iterable[str]) -> frozenset[str]:
-    """Return the kinds of event that channels with the given message schemas record."""
+    """Return the kinds of event in recordings whose channels have the given message schemas."""
     names = tuple(schemas)
     return frozenset(k for k, end in EVENT_SCHEMAS.items() if any(n.endswith(end) for n in names))

@@ -78,7 +78,7 @@ _T: Final = seconds_text('{0} - ":trace"."start_ns"')
 
 @dataclass(frozen=True, slots=True)
 class SqlStatement:
-    """SQL statement with its bound values, column names and temporary tables.
+    """SQL statement with its parameter values, column names and temporary tables.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class SqlStatement:
     last: str = ""
 
     def steps(self) -> list[tuple[str, dict[str, Any]]]:
-        """Return separate SQL statements with their values: one for each temporary table, then the last.
+        """Return separate SQL statements with their values: one per temporary table, then the last one.
 
         The result is the same as that of ``sql``. But the database plans each step with the exact number of
         rows of earlier steps. In one statement, it estimated 40 million rows for a pattern with 180, and
@@ -108,7 +108,7 @@ class SqlStatement:
         return [(text, self._bound(text)) for text in (*made, self.last or self.sql)]
 
     def _bound(self, text: str) -> dict[str, Any]:
-        """Return the values of the numbered parameters in a part of the SQL: number → value."""
+        """Return the parameter values that part of the SQL uses: parameter number → value."""
         numbers = {found[1] for found in _BOUND.finditer(text) if found[1]}
         return {number: self.values[int(number) - 1] for number in sorted(numbers)}
 
@@ -139,7 +139,7 @@ def rows(
     writer: SqlBuilder | None = None,
     span: Span | None = None,
 ) -> SqlStatement:
-    """Return the SQL for the results of a query, in the form of its ``RETURN`` clause.
+    """Return the SQL for the results of a query: rows, intervals or clips, as in its ``RETURN`` clause.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ def rows(
 def frames(
     query: Query, catalog: Catalog, window: Window | None = None, writer: SqlBuilder | None = None
 ) -> SqlStatement:
-    """Return the SQL for the matching frames, without duplicates, with their log times."""
+    """Return the SQL for all matching frames, each once, with their log times."""
     writer = writer or SqlBuilder(query, catalog, window)
     relation = frames_of(writer, query.scope, None, frozenset())
     outputs = [*_frame_columns(), (LOG_TIME, f'{_FRAME}."{LOG_TIME}"')]
@@ -192,13 +192,13 @@ def intervals(
     writer: SqlBuilder | None = None,
     span: Span | None = None,
 ) -> SqlStatement:
-    """Return the SQL for intervals of frames in which the returned values stay the same."""
+    """Return the SQL for intervals: series of frames in which the returned values stay the same."""
     query = _spelled(query, catalog)
     return _IntervalStatement(query, writer or SqlBuilder(query, catalog, window), span).statement()
 
 
 def about_frame(attributes: Sequence[FrameAttribute]) -> str:
-    """Return SQL for the attributes of one frame, given its id: one row."""
+    """Return SQL for attributes of one frame, given its id. The result is one row."""
     texts = [frame_text(one, _FRAME, _TRACE, '":map"') for one in attributes]
     select = Select(
         [f"{text} AS {quoted(column_of(a))}" for text, a in zip(texts, attributes, strict=True)]
@@ -209,7 +209,7 @@ def about_frame(attributes: Sequence[FrameAttribute]) -> str:
 
 
 def named_traces(conditions: Sequence[Bound]) -> tuple[str, list[Any]]:
-    """Return SQL for the names of the traces that meet conditions on their attributes, and its values."""
+    """Return SQL, and its values, for the names of the traces whose attributes meet conditions."""
     values = BoundValues()
     select = Select([f'{_TRACE}."name"'])
     select.join(f'"trace" AS {_TRACE}', [])
@@ -224,7 +224,7 @@ def named_traces(conditions: Sequence[Bound]) -> tuple[str, list[Any]]:
 
 
 def with_bindings(query: Query) -> Query:
-    """Return a query for intervals of frames in which the same nodes match.
+    """Return a query for intervals: series of frames in which the same nodes match.
 
     The columns are the nodes and their names.
     """
@@ -242,7 +242,7 @@ def with_bindings(query: Query) -> Query:
 
 
 def told_apart_by(query: Query) -> list[FrameAttribute]:
-    """Return the values passed by ``WITH`` that make two results with the same nodes different."""
+    """Return the ``WITH`` values that belong to a match: two matches differ if these values differ."""
     result = query.result
     if result.whole:
         return [one.value for one in result.columns if is_passed_on(one.value)]
@@ -325,14 +325,14 @@ class _RowStatement:
         return finished(self.writer, text, tuple(names))
 
     def _tops(self) -> dict[str, str]:
-        """Return the extra columns that ``LIMIT n PER value`` needs: column name → SQL."""
+        """Return extra columns for ``LIMIT n PER value``: column name → SQL."""
         top = self.result.top
         per = [] if top is None or top.per is None or isinstance(top.per, str) else [top.per]
         values = [*per, *self.top_owners]
         return {f":top {number}": self._text(value) for number, value in enumerate(values)}
 
     def _placed(self, relation: str) -> str:
-        """Return SQL for the matches, with their number in the default order as an extra column."""
+        """Return SQL for the matches, with one more column: the position of each in the default order."""
         select = Select([f"{_ROWS}.*"])
         select.join(nested(relation, ":rows"), [])
         frame, writer = f'{_ROWS}."frame_id"', self.writer
@@ -343,7 +343,7 @@ class _RowStatement:
         return select.text()
 
     def _outputs(self) -> list[tuple[str, str]]:
-        """Return the names and SQL texts of the result columns."""
+        """Return the names of the result columns, and their SQL."""
         texts: list[str] = []
         if self.result.whole or self.result.framed:
             texts += [text for _, text in _frame_columns()]
@@ -374,14 +374,14 @@ class _RowStatement:
         return self._of_group(leaf.name) if isinstance(leaf, GroupKey) else _column(leaf)
 
     def _of_group(self, name: str) -> str:
-        """Return the SQL of a grouping value. Repeated uses return the same text."""
+        """Return the SQL of a grouping value. A value used twice has the same SQL."""
         if name not in self.texts:
             value = next(c.value for c in self.result.columns if c.name == name)
             self.texts[name] = self._text(value)
         return self.texts[name]
 
     def _ordered(self, select: Select, names: list[str], tops: list[str]) -> str:
-        """Return SQL for the sorted and limited result rows. The default order follows ``ORDER BY``."""
+        """Return SQL for the sorted and limited rows. Rows with equal keys are in the default order."""
         keys = [directed(self._key(k.value), k.descending) for k in self.result.order]
         frame, own, writer = f'{_ROWS}."frame_id"', len(keys), self.writer
         grouped = self.grouped
@@ -419,7 +419,7 @@ class _RowStatement:
         return select.text()
 
     def _named_traces(self, keys: list[str], own: int) -> list[int]:
-        """Return the positions of sort keys that are trace names, if names are not in alphabetical order."""
+        """Return the positions of sort keys that are trace names; none if alphabetical order is right."""
         known = [trace.name for trace in self.writer.catalog.traces]
         if known == sorted(known):
             return []
@@ -485,7 +485,7 @@ class _IntervalStatement:
         return finished(self.writer, select.text(), names)
 
     def _hidden(self, told: dict[str, str]) -> dict[str, str]:
-        """Return extra columns that sort the intervals of several stores: first frame, and owners of nodes."""
+        """Return extra columns that sort the intervals of several stores: first frame, owners of nodes."""
         hidden = {FIRST: '":runs"."first"'}
         for name, chosen in ((OWNER_KEY, self.result.sample), (TOP_OWNER, self.result.top)):
             for owner in self._per(chosen, told)[1:]:
@@ -493,7 +493,7 @@ class _IntervalStatement:
         return hidden
 
     def _having(self, condition: Bound, columns: dict[str, str]) -> str:
-        """Return the SQL of the ``HAVING`` condition on an interval, from its columns."""
+        """Return the SQL of the ``HAVING`` condition for an interval, from the columns of the interval."""
 
         def leaf(found: Leaf) -> str:
             return columns[found.name] if isinstance(found, GroupKey) else self.keys[found]
@@ -518,7 +518,7 @@ class _IntervalStatement:
         return per
 
     def _told(self, value: Bound) -> str:
-        """Return the SQL of a returned value, computed from the constant columns of the interval."""
+        """Return the SQL of a returned value, from the columns that are constant in the interval."""
         if value in self.keys and not isinstance(value, NodeAttribute):
             return self.keys[value]
         return expression_text(value, self.keys.__getitem__, self.writer.values)
@@ -528,7 +528,7 @@ class _IntervalStatement:
         return shortest_text(text) if column.single else text
 
     def _keys(self) -> dict[str, str]:
-        """Return the columns that are constant in each interval: column → SQL of the value."""
+        """Return the columns that are constant in an interval: column → SQL of the value."""
         # A word of the vocabulary stays an internal number until it is returned.
         texts = [
             _column(value)
@@ -539,7 +539,7 @@ class _IntervalStatement:
         return dict(zip(self.keys.values(), texts, strict=True))
 
     def _spans(self, wanted: list[Leaf]) -> str:
-        """Return SQL for the first and last frame of each interval, with the constant columns."""
+        """Return SQL for the first and last frame of each interval, and for its constant columns."""
         scope = self.query.scope
         if self.span is not None:
             wanted = [*wanted, *self.span]
@@ -554,7 +554,7 @@ class _IntervalStatement:
         return runs(in_masks(self.writer, scope, wanted, self._keys()), keys, self.apart)
 
     def _between(self, spans: str) -> str:
-        """Return SQL for the number, times and log times of the first and last frame of each interval."""
+        """Return SQL for the number, time and log time of the first and of the last frame of each interval."""
         select = Select(['":from"."trace_id" AS "trace_id"', *self.keys.values()])
         select.columns += ['":from"."frame_id" AS "first"']
         select.columns += ['":to"."seq" - ":from"."seq" + 1 AS "frames"']
@@ -582,7 +582,7 @@ def _column(leaf: Leaf) -> str:
 
 
 def _kept(value: Bound) -> tuple[Bound, ...]:
-    """Return the expressions from which a value is computed later. For the name of a node: its kind and id."""
+    """Return the expressions needed to compute a value later: kind and id for the name of a node."""
     return (
         tuple(leaves(value)) if isinstance(value, Operation) and value.word == "name" else (value,)
     )
@@ -604,7 +604,7 @@ def _name_of(node: str, query: Query, catalog: Catalog) -> Bound:
 
 
 def _spelled(query: Query, catalog: Catalog) -> Query:
-    """Return a query that builds the names of nodes in its outermost SELECT, which is faster."""
+    """Return a query that builds node names in the outermost SELECT only, which is faster."""
 
     def spelled(value: Bound) -> Bound:
         match value:
@@ -633,7 +633,7 @@ def _from_frames(select: Select, relation: str) -> None:
 
 
 def shortest_text(text: str) -> str:
-    """Return SQL that converts a 32-bit number to a 64-bit number with the same shortest decimal text."""
+    """Return SQL that converts a 32-bit number to the 64-bit number with the same decimal digits."""
     return f"CAST(CAST(CAST({text} AS FLOAT) AS VARCHAR) AS DOUBLE)"
 
 
@@ -651,7 +651,7 @@ def directed(text: str, descending: bool) -> str:  # noqa: FBT001
 
 
 def _per(result: Result, chosen: Sampling | None) -> Bound | None:
-    """Return the value in ``SAMPLE n PER value`` or ``LIMIT n PER value``, or None."""
+    """Return the value in ``SAMPLE n PER value`` or ``LIMIT n PER value``; None without it."""
     per = chosen and chosen.per
     if isinstance(per, str):
         return next((column.value for column in result.columns if column.name == per), None)
@@ -659,14 +659,14 @@ def _per(result: Result, chosen: Sampling | None) -> Bound | None:
 
 
 def _told_apart(select: Select, names: list[str], apart: list[NodeAttribute]) -> Select:
-    """Return SQL for distinct rows. Equal node ids of different traces or maps count as different."""
+    """Return SQL that removes duplicate rows. Equal node ids of different traces do not count as equal."""
     select.columns += [f'{_column(one)} AS ":owner {i}"' for i, one in enumerate(apart)]
     return Select([quoted(name) for name in names], [nested(select.text(), ":distinct")])
 
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """Selection of a number of rows for each combination of some values, as for ``SAMPLE n PER value``.
+    """Selection of some rows from each group of rows with equal values, as in ``SAMPLE n PER value``.
 
     Without a frame, or with ``first`` sort keys, the first rows are selected. Otherwise, rows are selected by
     a pseudo-random number computed from the frame.
@@ -681,7 +681,7 @@ class Chosen:
 def sampled(
     select: Select, columns: list[str], names: list[str], keys: list[str], chosen: Chosen
 ) -> tuple[Select, list[str]]:
-    """Return the SELECT statement for some rows of each group, and its sort keys."""
+    """Return a SELECT statement for some rows of each group, and the sort keys for its result."""
     partition = [f'":per {place}"' for place in range(len(chosen.per))]
     if chosen.frame is not None:
         select.columns.append(f'{chosen.frame} % 1000003 * 48271 % 2147483647 AS ":mixed"')
@@ -700,7 +700,7 @@ def sampled(
 
 
 def keyed(select: Select, names: list[str], keys: list[str]) -> list[str]:
-    """Add sort keys to a SELECT statement as columns. Return the sort keys for the statement around it."""
+    """Add sort keys as columns to a SELECT statement. Return the keys with which to sort its result."""
     ordered = [key.removesuffix(" NULLS LAST") for key in keys]
     plain = [key.removesuffix(" ASC").removesuffix(" DESC") for key in ordered]
     inner = [key if key in names else f'":key {i}"' for i, key in enumerate(plain)]
@@ -712,12 +712,12 @@ def keyed(select: Select, names: list[str], keys: list[str]) -> list[str]:
 
 
 def in_order(part: Bound) -> bool:
-    """True if the value of an expression depends on the order of matches, as for ``collect``."""
+    """True if the value of an expression depends on the order of the matches, as for ``collect``."""
     return isinstance(part, Aggregate) and part.word == "collect" and not part.distinct
 
 
 def finished(writer: SqlBuilder, text: str, columns: Iterable[str]) -> SqlStatement:
-    """Return the final SQL statement, with the shared subqueries in a ``WITH`` clause."""
+    """Return the complete SQL statement. Shared subqueries are in its ``WITH`` clause."""
     shadows = [
         (f"{quoted(name)} AS NOT MATERIALIZED", body) for name, body in writer.catalog.shadows
     ]
@@ -729,7 +729,7 @@ def finished(writer: SqlBuilder, text: str, columns: Iterable[str]) -> SqlStatem
 
 
 def _preceded(relations: Iterable[tuple[str, str]], text: str) -> str:
-    """Return an SQL statement with a ``WITH`` clause of named subqueries."""
+    """Return an SQL statement whose ``WITH`` clause contains the named subqueries."""
     before = ",\n".join(
         f"{head} (\n" + "\n".join(f"  {line}" for line in body.splitlines()) + "\n)"
         for head, body in relations

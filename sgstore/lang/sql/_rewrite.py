@@ -1,4 +1,4 @@
-"""Rules that rewrite a query into a faster query with the same meaning.
+"""Rules that rewrite a query into an equal, but faster query.
 
 Each rule converts a scope to a scope. Its docstring explains the change and why the meaning stays the same.
 No rule can fail.
@@ -76,7 +76,7 @@ _OPPOSITE: Final = {"=": "<>", "<>": "=", "<": ">=", ">=": "<", ">": "<=", "<=":
 
 
 def rewritten(query: Query, catalog: Catalog) -> Query:
-    """Return an equivalent query that is faster to evaluate, after all rewriting rules."""
+    """Apply all rewriting rules: return an equal query that runs faster."""
     if query.stages:
         return _staged(query, catalog)
     # Not for stages: a node of OPTIONAL MATCH lacks every value where it is absent.
@@ -107,7 +107,7 @@ def _ruled(query: Query, catalog: Catalog) -> Query:
 
 
 def _staged(query: Query, catalog: Catalog) -> Query:
-    """Return an equivalent, faster query with several clauses (``MATCH``, ``WITH``).
+    """Apply all rewriting rules to a query with several clauses (``MATCH``, ``WITH``).
 
     The rules apply to each clause.
 
@@ -158,7 +158,7 @@ def _staged(query: Query, catalog: Catalog) -> Query:
 
 
 def path_ways(stage: MatchStage, *, injective: bool) -> Iterator[PathWay]:
-    """Yield one pattern of a ``MATCH`` clause for each combination of path lengths of its named paths."""
+    """Yield patterns of a ``MATCH`` clause in which each named path has a fixed length."""
     edges = {edge.key: edge for edge in stage.scope.edges}
     repeated = [edges[key] for path in stage.paths for key, _ in path.edges if edges[key].high > 1]
     for lengths in product(*(range(edge.low, edge.high + 1) for edge in repeated)):
@@ -177,7 +177,7 @@ def path_ways(stage: MatchStage, *, injective: bool) -> Iterator[PathWay]:
 
 
 def _kinds_in(scopes: Iterable[Scope]) -> dict[str, Kinds]:
-    """Return the node kinds that are possible in at least one of several patterns: node → kinds."""
+    """Return, for each node, the kinds that are possible in at least one of several patterns."""
     every = list(scopes)
     found: dict[str, Kinds] = {}
     for scope in [one for one in every if one.where != (FALSE,)] or every:
@@ -187,7 +187,7 @@ def _kinds_in(scopes: Iterable[Scope]) -> dict[str, Kinds]:
 
 
 def _expression(value: Any, values: Callable[[Result], Result]) -> Any:
-    """Apply the rewriting rules for result columns to one expression."""
+    """Apply the rewriting rules for returned values to a single expression."""
     return values(Result(columns=(ReturnColumn("", value),))).columns[0].value
 
 
@@ -195,7 +195,7 @@ _Rule = Callable[[Scope, Catalog], Scope]
 
 
 def _in_scopes(rule: _Rule, query: Query, catalog: Catalog) -> Query:
-    """Apply a rewriting rule to every graph pattern of a query, patterns in braces first."""
+    """Apply a rewriting rule to all graph patterns of a query, first to patterns in braces."""
 
     def inside(expression: Bound) -> Bound:
         if isinstance(expression, BlockValue):
@@ -210,7 +210,7 @@ def _in_scopes(rule: _Rule, query: Query, catalog: Catalog) -> Query:
 
 
 def nothing_beyond(scope: Scope, catalog: Catalog) -> Scope:
-    """Replace the attribute ``in_graph`` by true, unless the query may match entities outside scene graphs."""
+    """Replace the attribute ``in_graph`` by true, unless the query uses entities outside scene graphs."""
 
     def known(value: Bound) -> Bound:
         if isinstance(value, NodeAttribute) and value.attribute.unit is DisplayUnit.inside:
@@ -239,7 +239,7 @@ def computed_or_imported(scope: Scope, catalog: Catalog) -> Scope:
 
 
 def values_lacking(scope: Scope, catalog: Catalog) -> Scope:
-    """Replace ``v.heading IS NULL`` by a test of the kinds that have no heading in some frame of the store.
+    """Replace ``v.heading IS NULL`` by a test of the node kinds that can lack a heading in the store.
 
     Such conditions come from checks, which ask whether a value is unknown. Most recordings have all values.
     """
@@ -267,7 +267,7 @@ def values_lacking(scope: Scope, catalog: Catalog) -> Scope:
 
 
 def _folded(value: Bound) -> Bound:
-    """Return an equivalent condition without constants in AND, OR, NOT and CASE."""
+    """Return an equal condition: constants in AND, OR, NOT and CASE are removed."""
     match value:
         case Operation("=", (Value(value=one, type=kind), Value(value=other, type=same))) if (
             kind is same and one is not None and other is not None
@@ -286,7 +286,7 @@ def _folded(value: Bound) -> Bound:
 
 
 def _branch(value: Operation) -> Bound:
-    """Return an equivalent ``CASE`` without the first branches if their conditions are constant."""
+    """Return an equal ``CASE``: the first branches are removed if their conditions are constant."""
     match value.operands:
         case (otherwise,):
             return otherwise
@@ -299,7 +299,7 @@ def _branch(value: Operation) -> Bound:
 
 
 def _joined(word: str, operands: tuple[Bound, ...]) -> Bound:
-    """Join conditions by AND or OR, without constants. A label common to all parts of an OR is put first."""
+    """Join conditions by AND or OR. Constants are removed, and a label common to all parts comes first."""
     neutral, strong = (TRUE, FALSE) if word == "AND" else (FALSE, TRUE)
     rest = [one for one in operands if one != neutral]
     if not rest:
@@ -312,7 +312,7 @@ def _joined(word: str, operands: tuple[Bound, ...]) -> Bound:
 
 
 def _common_label(ways: Sequence[Bound]) -> LabelTest | None:
-    """Return the label that follows from each of several conditions on the same node, or None."""
+    """If all conditions require a label of the same node, return the common label; otherwise None."""
     labels: list[LabelTest] = []
     for way in ways:
         label = way.operands[0] if isinstance(way, Operation) and way.word == "AND" else way
@@ -326,7 +326,7 @@ def _common_label(ways: Sequence[Bound]) -> LabelTest | None:
 
 
 def push_negations(scope: Scope, _: Catalog) -> Scope:
-    """Move ``NOT`` inwards in the conditions of a pattern, so that more conditions can be tested separately.
+    """Move ``NOT`` inside AND and OR in the conditions of a pattern. Then more parts can be separate.
 
     De Morgan's laws and ``NOT a < b`` = ``a >= b`` hold in three-valued logic too.
     """
@@ -394,7 +394,7 @@ def _existence(condition: Bound) -> Bound:
 
 
 def counted_block(condition: Bound) -> tuple[BlockValue, str, float] | None:
-    """Return pattern, sign and number of a condition ``COUNT {…} sign number``; None for others."""
+    """Split a condition ``COUNT {…} > n`` or similar into pattern, sign and number; None for others."""
     match condition:
         case Operation(
             word, (BlockValue(word="COUNT") as block, Value(value=int() | float() as n))
@@ -409,12 +409,12 @@ def counted_block(condition: Bound) -> tuple[BlockValue, str, float] | None:
 
 
 def complement(sign: str) -> str:
-    """Return the negated comparison sign, such as ``>=`` for ``<``."""
+    """Return the opposite of a comparison sign, such as ``>=`` for ``<``."""
     return _OPPOSITE[sign]
 
 
 def unfold_paths(scope: Scope, _: Catalog, *, injective: bool) -> Scope:
-    """Replace each path of exactly n edges by n single edges, with hidden nodes between them.
+    """Replace each path of exactly n edges by n edges. New nodes connect them.
 
     If nodes must differ, the hidden nodes differ from each other and from both ends. They may coincide with
     other nodes of the pattern. The same holds for a path of m to n edges.
@@ -426,7 +426,7 @@ def unfold_paths(scope: Scope, _: Catalog, *, injective: bool) -> Scope:
 
 
 def chain(scope: Scope, edge: Edge, length: int, *, injective: bool) -> Scope:
-    """Return a pattern in which a path becomes ``length`` single edges, with hidden nodes between them."""
+    """Return a pattern in which single edges, connected by new nodes, replace a path."""
     between = [f"#{edge.key}.{number}" for number in range(1, length)]
     stops = [edge.src, *between, edge.dst]
     hidden = {key: Node(key, any_kinds(), "hidden", edge.span) for key in between}
@@ -444,7 +444,7 @@ def chain(scope: Scope, edge: Edge, length: int, *, injective: bool) -> Scope:
 
 
 def labels_from_conditions(scope: Scope, _: Catalog) -> Scope:
-    """Replace conditions such as ``v.kind = 'car'`` or ``v.is_ego`` by labels, which are faster to test."""
+    """Replace conditions such as ``v.kind = 'car'`` or ``v.is_ego`` by labels, which SQL tests faster."""
     nodes, rest = dict(scope.nodes), list[Bound]()
     for condition in scope.where:
         key, kinds = _label(condition)
@@ -474,7 +474,7 @@ def _label(condition: Bound) -> tuple[str, Kinds]:
 
 
 def open_exists(scope: Scope, catalog: Catalog) -> Scope:
-    """Merge the pattern of a required ``EXISTS {…}`` into the pattern around it. Its nodes become hidden.
+    """Merge a required ``EXISTS {…}`` into the pattern around it. Its nodes are not reported.
 
     This needs a free node: one that the block binds, but no edge of the pattern. Otherwise, such a node would
     be tried with every entity of the frame. If several blocks are separate relations (:func:`stands_alone`),
@@ -504,7 +504,7 @@ LONG_WAY: Final = 3
 
 
 def stands_alone(condition: Bound, catalog: Catalog) -> TypeGuard[BlockValue]:
-    """True if an ``EXISTS {…}`` with a long path is evaluated as a separate subquery.
+    """True if SQL evaluates an ``EXISTS {…}`` with a long path as a subquery of its own.
 
     This occurs only in scope ``world``.
     """
@@ -519,7 +519,7 @@ def stands_alone(condition: Bound, catalog: Catalog) -> TypeGuard[BlockValue]:
 
 
 def _of_table(leaf: NodeAttribute) -> bool:
-    """True if an attribute of a node is stored in the table of the node."""
+    """True if the table of a node contains an attribute."""
     bare = {DisplayUnit.role, DisplayUnit.own, DisplayUnit.owner, DisplayUnit.inside}
     return leaf.attribute.unit not in bare
 
@@ -543,7 +543,7 @@ def _merged(scope: Scope, block: BlockValue) -> Scope:
 
 
 def narrowed(scope: Scope, catalog: Catalog) -> Scope:
-    """Limit the nodes of a pattern to the kinds for which the store has the required edges.
+    """Restrict the nodes of a pattern to kinds that have the required edges in the store.
 
     If the edges of a pattern do not occur in the store, its condition becomes false.
     """
@@ -558,7 +558,7 @@ def narrowed(scope: Scope, catalog: Catalog) -> Scope:
 def kinds_left(
     scope: Scope, triples: Collection[Triple], held: frozenset[str]
 ) -> dict[str, Kinds] | None:
-    """Return the possible kinds of each pattern node, given the triples (relation, kind, kind) in a store.
+    """Return the possible kinds of each pattern node in a store that has the given kinds of edges.
 
     ``None`` means no match.
     """
@@ -571,10 +571,7 @@ def kinds_left(
 
 
 def _pass(kinds: dict[str, Kinds], edges: list[Edge], ways: list[list[Triple]]) -> bool:
-    """Remove the node kinds and triples that edges of the pattern exclude. This is one pass.
-
-    Return True if something changed.
-    """
+    """Remove kinds of nodes and edges that the edges of a pattern exclude. True if this changed them."""
     changed = False
     for place, edge in enumerate(edges):
         starts, ends = kinds[edge.src].every, kinds[edge.dst].every
@@ -605,7 +602,7 @@ def possible(edge: Edge, src: Kinds, dst: Kinds, triples: Iterable[Triple]) -> I
 
 
 def ordered(scope: Scope, catalog: Catalog, begin: Iterable[str] = ()) -> Scope:
-    """Sort the edges of a pattern, rarest first. Each is connected to an earlier edge if possible.
+    """Sort the edges of a pattern: rarest first, and each connected to an earlier one if possible.
 
     ``begin`` are additional nodes to begin at.
     """
@@ -627,12 +624,12 @@ def ordered(scope: Scope, catalog: Catalog, begin: Iterable[str] = ()) -> Scope:
 
 
 def labels_to_conditions(scope: Scope, _: Catalog) -> Scope:
-    """Replace labels that a pattern in braces requires of outer nodes by conditions on attributes."""
+    """In braces, replace labels of nodes from outside by conditions on their attributes."""
     return replace(scope, where=tuple(map(_attributes, scope.where)))
 
 
 def _attributes(condition: Bound) -> Bound:
-    """Return an expression in which conditions on the kind replace label tests."""
+    """Return an expression in which conditions on the kind of a node replace labels."""
     if not isinstance(condition, LabelTest):
         return with_operands(condition, _attributes)
     kind = NodeAttribute(condition.node, NODE_ATTRIBUTES["kind"], Type.text)
@@ -656,7 +653,7 @@ INVARIANT: Final = FrameAttribute(
 
 
 def is_lasting(leaf: Leaf, scope: Scope, catalog: Catalog) -> bool:
-    """True if a value of a match is constant within a bucket of 64 frames."""
+    """True if a value of a match cannot change within a bucket of 64 frames."""
     match leaf:
         case NodeValue() | EdgeRelation() | TraceAttribute():
             return True
@@ -672,7 +669,7 @@ def is_lasting(leaf: Leaf, scope: Scope, catalog: Catalog) -> bool:
 
 
 def count_by_buckets(query: Query, catalog: Catalog) -> Query:
-    """Replace ``COUNT(*)`` by a sum of frame counts of SQL rows, if no value changes within a bucket.
+    """Replace ``COUNT(*)`` by a sum of frame counts, if no value can change within a bucket.
 
     All values must be constant within a bucket. Other aggregates must not depend on how often a value occurs.
     """
@@ -711,7 +708,7 @@ _MORE: Final = {">", ">=", "="}
 
 
 def bounds(conditions: list[Bound]) -> list[Bound]:
-    """Return cheaper conditions that follow from the given conditions.
+    """Return conditions that follow from the given ones and are faster to test.
 
     Example: ``gap < t`` implies that a lower bound of ``gap`` is at most t.
     """
@@ -738,7 +735,7 @@ def _bound(pair: PairNumber, limit: Bound) -> list[Bound]:
 
 
 def is_dear(leaf: Leaf) -> bool:
-    """True if a number of two entities is expensive to compute."""
+    """True if a number of two entities takes long to compute."""
     return (
         isinstance(leaf, PairNumber)
         and leaf.function in PAIR_FUNCTIONS

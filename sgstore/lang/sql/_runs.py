@@ -1,4 +1,4 @@
-"""SQL for runs (consecutive frames with the same values), computed from bit masks of frames.
+"""SQL for runs (consecutive frames with equal values). It uses bit masks of frames.
 
 A frame *continues* a run if the same keys hold in the frame before it, without a gap in the recording
 between the two (``bucket.joined``). A frame of a mask that continues no run is the first of a run. A frame
@@ -18,7 +18,7 @@ _LAST: Final = 59
 
 
 def runs(masks: str, keys: list[str], apart: list[str]) -> str:
-    """Return SQL for the longest runs of consecutive frames of a trace with the same key values.
+    """Return SQL for the longest runs: consecutive frames of a trace with equal key values.
 
     Parameters
     ----------
@@ -69,5 +69,5 @@ def runs(masks: str, keys: list[str], apart: list[str]) -> str:
 
 
 def _first_of(mask: str) -> str:
-    """Return SQL for the first frame in a bit mask of frames: its lowest bit."""
+    """Return SQL for the first frame of a bit mask, which is its lowest bit."""
     return f'"bucket" * 64 + bit_count(("{mask}" & -"{mask}") - 1)'

@@ -17,19 +17,19 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class BoundValues:
-    """Parameter values of an SQL statement, in the order of ``$1``, ``$2``, …."""
+    """Values of the parameters ``$1``, ``$2``, … of an SQL statement."""
 
     items: list[Any] = field(default_factory=list[Any])
 
     def add(self, value: object) -> str:
-        """Add a parameter value to the SQL statement, and return its placeholder, such as ``$3``."""
+        """Add a parameter value to the SQL statement. Return the name of the parameter, such as ``$3``."""
         self.items.append(value)
         return f"${len(self.items)}"
 
 
 @dataclass(slots=True)
 class Select:
-    """Builder of an SQL ``SELECT`` statement: one line for each column, table and condition.
+    """SQL ``SELECT`` statement under construction: its columns, tables and conditions.
 
     If ``lenient``, tables are joined by ``LEFT JOIN``, so rows without a partner are kept.
     """
@@ -59,7 +59,7 @@ class Select:
         return "\n".join(lines)
 
     def join(self, table: str, conditions: Sequence[str], how: str = "JOIN") -> None:
-        """Add a table to the ``SELECT`` statement. Without conditions it is a cross join."""
+        """Join a table to the ``SELECT`` statement. Without conditions, it is a cross join."""
         if not self.tables:
             self.tables.append(table)
             self.where += conditions
@@ -71,10 +71,10 @@ class Select:
 
 
 def indented(text: str) -> str:
-    """Return SQL text, indented for use in another statement."""
+    """Return SQL text with indentation, for use inside another statement."""
     return "\n".join(f"    {line}" for line in text.splitlines())
 
 
 def nested(text: str, name: str) -> str:
-    """Return SQL text in brackets with a name, for use in ``FROM`` of another statement."""
+    """Return SQL text in brackets and with a name, for the ``FROM`` of another statement."""
     return f"(\n{indented(text)}\n  ) AS {quoted(name)}"

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 
 def staged_matches(query: Query, catalog: Catalog, window: Window | None) -> SqlBuilder:
-    """Return an SQL builder for a query with several clauses. Its matches are a shared subquery.
+    """Return an SQL builder for a query with several clauses. One shared subquery has all matches.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def _first(sql: SqlBuilder, query: Query, stage: MatchStage) -> SharedRelation:
 
 
 def _late(stage: MatchStage) -> tuple[list[Bound], list[Leaf]]:
-    """Return the conditions of a ``MATCH`` on ``WITH`` values and paths, and the values that they need."""
+    """Return the conditions of a ``MATCH`` on ``WITH`` values and paths, and the other values in them."""
     late = [one for one in stage.scope.where if _speaks_of_passed(one)]
     wanted = [leaf for one in late for leaf in leaves(one) if not is_passed_on(leaf)]
     return late, list(dict.fromkeys(wanted))
@@ -90,7 +90,7 @@ def _pattern(
     rows: SharedRelation | None,
     wanted: list[Leaf],
 ) -> str:
-    """Return SQL for the matches of one ``MATCH`` clause, with named paths as lists and the wanted values."""
+    """Return SQL for the matches of one ``MATCH`` clause, with the wanted values, and paths as lists."""
     nodes, edges = _bound(stage.scope)
     outer = frozenset(stage.scope.outer)
     texts: list[str] = []
@@ -127,7 +127,7 @@ def _with_paths(
 def _joined(
     sql: SqlBuilder, query: Query, rows: SharedRelation, stage: MatchStage
 ) -> SharedRelation:
-    """Join the matches of a later ``MATCH`` clause to the rows of the previous clauses."""
+    """Join the matches of a later ``MATCH`` clause to the matches of the earlier clauses."""
     outer = frozenset(stage.scope.outer)
     nodes, edges = _bound(stage.scope)
     late, wanted = _late(stage)
@@ -156,13 +156,13 @@ def _joined(
 
 
 def _bound(scope: Scope) -> tuple[frozenset[str], frozenset[str]]:
-    """Return the keys of the nodes and edges that distinguish two matches of a pattern."""
+    """Return the keys of nodes and edges that count: two matches differ if one of them differs."""
     nodes = frozenset(key for key, node in scope.nodes.items() if node.role != "hidden")
     return nodes, frozenset(edge.key for edge in scope.edges if edge.named)
 
 
 def _given(sql: SqlBuilder, rows: SharedRelation, outer: frozenset[str]) -> SharedRelation:
-    """Return a subquery with the outer nodes of a pattern and bit masks of their frames.
+    """Return a subquery with the nodes that ``{…}`` uses from outside, and their frames as bit masks.
 
     Rows with NULL are excluded.
     """
@@ -179,7 +179,7 @@ def _speaks_of_passed(condition: Bound) -> bool:
 def _passed(
     sql: SqlBuilder, query: Query, rows: SharedRelation, stage: WithStage
 ) -> SharedRelation:
-    """Return the subquery of the rows that a ``WITH`` clause passes on."""
+    """Return a subquery with the rows that a ``WITH`` clause passes to the next clause."""
     values = [column.value for column in stage.values]
     collected = any(in_order(part) for value in values for part in walk(value))
     text = _of_rows(sql, query, rows, stage.before, values)
@@ -228,7 +228,7 @@ def _told(rows: SharedRelation) -> list[str]:
 def _of_rows(
     sql: SqlBuilder, query: Query, rows: SharedRelation, scope: Scope, values: Iterable[Bound]
 ) -> str:
-    """Return SQL for the rows of the previous clauses, with extra columns for some values."""
+    """Return SQL for the rows of the earlier clauses, with columns for more values."""
     asked = replace(query, scope=scope, result=Result(), stages=())
     sql.query, sql.found = asked, rows
     wanted: list[Leaf] = [leaf for value in values for leaf in leaves(value)]
@@ -247,7 +247,7 @@ def _leaf_of(texts: dict[str, str]) -> Callable[[Leaf], str]:
 def _chosen(
     sql: SqlBuilder, query: Query, rows: SharedRelation, stage: WithStage
 ) -> SharedRelation:
-    """Return a subquery for ``LIMIT`` and ``WHERE`` of a ``WITH`` clause: the selected rows of each frame."""
+    """Return a subquery with the rows that ``LIMIT`` and ``WHERE`` of a ``WITH`` clause keep."""
     columns = ['"frame_id"', *columns_of(rows.nodes, rows.edges), *_told(rows)]
     if stage.skip or stage.limit is not None:
         keys = [

@@ -44,21 +44,21 @@ _TWICE: Final = frozenset({"id", "type"})
 
 @dataclass(frozen=True, slots=True)
 class _ValuePlace:
-    """Node or edge of a pattern, with the positions of its values in an SQL row."""
+    """Node or edge of a pattern, and the positions of its values in an SQL row."""
 
     part: Node | Edge
     first: int
     names: tuple[str, ...]
 
     def known(self, row: Sequence[Any]) -> Record:
-        """Return the values of this node or edge from an SQL row, without NULL."""
+        """Return the values of this node or edge in an SQL row, except NULL."""
         values = zip(self.names, row[self.first :], strict=False)
         return {name: value for name, value in values if value is not None}
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Query for ``RETURN SUBGRAPHS``, with the positions of all graph values in its rows.
+    """Query for ``RETURN SUBGRAPHS``, and the positions of the graph values in its rows.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ class Layout:
 
     @classmethod
     def of(cls, query: Query) -> Layout:
-        """Return the layout of the subgraph values in the rows of a query.
+        """Return a query for subgraphs, and the positions of the graph values in its rows.
 
         The query's own columns stay first.
         """
@@ -106,14 +106,14 @@ class Layout:
         return cls(replace(query, scope=scope, result=framed), names, tuple(places), width)
 
     def row(self, row: Sequence[Any]) -> tuple[Any, ...]:
-        """Convert an SQL row to a result row: own columns, then nodes and edges of the subgraph."""
+        """Convert an SQL row to a result row: the returned values, then nodes and edges of the subgraph."""
         bound = {place.part.key: place.known(row) for place in self.places}
         parts = [(place.part, bound[place.part.key]) for place in self.places]
         return (*row[: self._width], *graph_of(parts))
 
 
 def _bound_variables(query: Query) -> Scope:
-    """Return a pattern that reports all nodes and single edges. Paths of fixed length become single edges."""
+    """Return a pattern that reports all nodes and all edges, except paths of variable length."""
     scope = unfold_paths(query.scope, Catalog(), injective=query.injective)
     nodes = {
         key: replace(node, role="unnamed") if node.role == "hidden" else node
@@ -124,7 +124,7 @@ def _bound_variables(query: Query) -> Scope:
 
 
 def graph_of(parts: Sequence[tuple[Node | Edge, Record]]) -> tuple[list[Record], list[Record]]:
-    """Return the nodes and edges of a match as records, in the order of the pattern.
+    """Return the nodes and edges of a match as dictionaries, in the order of the pattern.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ def path_text(edge: Edge) -> str:
 
 
 def _of_node(node: Node) -> list[tuple[str, NodeValue | NodeAttribute]]:
-    """Return the id and the possible attributes of a pattern node: pairs of name and expression."""
+    """Return (name, expression) for the id and each attribute that a pattern node can have."""
     known: list[tuple[str, NodeValue | NodeAttribute]] = [("id", NodeValue(node.key))]
     return known + [
         (attribute.name, NodeAttribute(node.key, attribute, attribute.type))
@@ -186,7 +186,7 @@ def _of_edge(edge: Edge) -> list[tuple[str, EdgeRelation | EdgeAttribute]]:
 
 
 def edge_attributes(edge: Edge) -> Iterator[Attribute]:
-    """Yield the attributes that an edge of a query pattern can have."""
+    """Yield the attributes that an edge of a pattern can have."""
     if edge.high > 1 or len(edge.relations) > 1:
         return
     for attribute in EDGE_ATTRIBUTES.values():
@@ -200,7 +200,7 @@ def edge_attributes(edge: Edge) -> Iterator[Attribute]:
 def graph_text(
     nodes: Sequence[Mapping[str, Any]], edges: Sequence[Mapping[str, Any]]
 ) -> tuple[str, str]:
-    """Return nodes and edges of a graph as text: ``e = car 0, v = car 3`` and ``car 0 -near-> car 3``."""
+    """Return the nodes and edges of a graph as text, such as ``e = car 0`` and ``car 0 -near-> car 3``."""
     called = {node["id"]: str(node.get("name", node["id"])) for node in nodes}
     named = (" = ".join([*node["variables"], called[node["id"]]]) for node in nodes)
     lines = (

@@ -1,4 +1,4 @@
-"""Splitting of a ``UNION`` query into its single queries, and SQL that joins their rows.
+"""Splitting of a ``UNION`` into single queries, and SQL that combines their rows.
 
 Each part is a separate query with its own settings, order and limits. :class:`sgstore.matches.UnionMatches`
 joins their answers.
@@ -54,7 +54,7 @@ class UnionParts:
     distinct: bool
 
     def each(self, find: Callable[[str, Mapping[str, Any]], T], text: str) -> list[T]:
-        """Call a function with each query of the union, and return the list of results.
+        """Call a function for each query of the union, and return its results as a list.
 
         Raises
         ------
@@ -73,7 +73,7 @@ _LETTER: Final = re.compile(r"[^\n]")
 
 
 def union_parts(text: str, values: Mapping[str, Any]) -> UnionParts | None:
-    """Return the single queries of a ``UNION`` text, or None for a text without ``UNION``.
+    """Return the single queries of a text with ``UNION``; None without ``UNION``.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ def union_parts(text: str, values: Mapping[str, Any]) -> UnionParts | None:
 
 
 def _parameters_of(part: s.MatchClause, defined: Iterable[s.Define]) -> set[str]:
-    """Return the names of the parameters that one query of a union uses, also through definitions."""
+    """Return the names of the parameters that a query of a union uses, itself or by its definitions."""
     found, waiting = set(s.parameters_in(part)), {*_called(part)}
     by_name = {normalize_name(one.name): one for one in defined}
     while used := waiting & by_name.keys():
@@ -141,7 +141,7 @@ def _alone(text: str, union: TextSpan, part: TextSpan) -> str:
 def joined_rows(
     columns: Sequence[str], tables: Sequence[str], result: Sequence[Result], *, distinct: bool
 ) -> tuple[Select, bool]:
-    """Return SQL that joins the rows of several result tables of a ``UNION``.
+    """Return SQL that combines the rows of several result tables of a ``UNION``.
 
     Parameters
     ----------
@@ -186,6 +186,6 @@ _TRACE_NAME: Final = TraceAttribute(TRACE_ATTRIBUTES["name"], Type.text)
 
 
 def each_match(statements: Iterable[s.Statement]) -> Iterator[s.Statement]:
-    """Yield query statements, with each ``UNION`` replaced by its single queries."""
+    """Yield query statements. Each ``UNION`` is replaced by its single queries."""
     for statement in statements:
         yield from statement.parts if isinstance(statement, s.UnionClause) else (statement,)

@@ -1,4 +1,4 @@
-"""Windows of frames for processing in portions, and the order of traces by name (``run2`` before ``run10``).
+"""Windows of frames to process in portions, and the order of traces by name (``run2``, ``run10``).
 
 Trace ids are digests, so their order has no meaning. A catalog has its traces in order (see
 :attr:`sgstore.lang.catalog.Catalog.traces`). Rows are sorted by the index of their trace in the catalog,
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Range of frame buckets (64 frames each), from ``low`` up to, but not including, ``high``.
+    """Range of buckets (64 frames each), from ``low`` to just before ``high``.
 
     ``traces`` limits it to some traces.
     """
@@ -32,7 +32,7 @@ class Window:
 
     @classmethod
     def of(cls, extents: Sequence[tuple[int, int]]) -> Window:
-        """Return the smallest window that contains some ranges of buckets (64 frames each).
+        """Return the smallest window that contains the given ranges of buckets (64 frames each).
 
         The ranges are whole traces, or a part of one trace.
         """
@@ -41,7 +41,7 @@ class Window:
         return cls(low, high, traces if len(traces) > 1 else None)
 
     def whole(self, extents: Iterable[tuple[int, int]]) -> Window:
-        """Return the window without its list of traces, if no other trace begins in its range."""
+        """Return the window, without its list of traces if its range has no other traces."""
         if self.traces is None:
             return self
         many = sum(self.low <= first < self.high for first, _ in extents)
@@ -60,14 +60,14 @@ TRACE_OF_FRAME: Final = 24
 
 
 def extents(catalog: Catalog) -> list[tuple[int, int]]:
-    """Return the first bucket (of 64 frames) and the number of buckets of each trace, in trace order."""
+    """Return, for each trace in order, the number of its first bucket (64 frames) and its bucket count."""
     return [trace.extent for trace in catalog.traces]
 
 
 def frame_key(
     select: Select, frame: str, catalog: Catalog, window: Window | None, values: BoundValues
 ) -> str:
-    """Return an SQL sort key for frames: by the order of traces, then by frame.
+    """Return an SQL sort key for frames: first the order of traces, then the frame number.
 
     The key is one number, which sorts fastest: the frame id, with the index of the trace instead of its id.
     If the ids are already in trace order, the key is the frame id.
@@ -99,7 +99,7 @@ def frame_key(
 def name_key(
     select: Select, number: int, column: str, catalog: Catalog, values: BoundValues
 ) -> str:
-    """Return an SQL sort key that sorts trace names in natural order: ``run2`` before ``run10``.
+    """Return an SQL sort key for trace names that puts ``run2`` before ``run10``.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ def _join(
     column: str,
     values: BoundValues,
 ) -> None:
-    """Join a list to the ``SELECT`` statement that assigns a number to each value of a column."""
+    """Join a list to a ``SELECT`` statement. The list gives a number to each value of a column."""
     kind, keys = known
     text = (
         f'SELECT unnest(CAST({values.add(list(keys))} AS {kind}[])) AS ":trace",'

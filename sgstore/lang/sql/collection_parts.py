@@ -73,7 +73,7 @@ Terms = list[str]
 
 @dataclass(frozen=True, slots=True)
 class Parted:
-    """Queries for each store of a collection, with the rule that merges their results.
+    """Queries that each store of a collection runs, and a rule to merge the results.
 
     Attributes
     ----------
@@ -91,7 +91,7 @@ class Parted:
     merge: Callable[[Catalog, BoundValues], str]
 
     def compiled(self, whole: Compiled) -> tuple[Compiled, ...]:
-        """Return the compiled queries for each store of the collection."""
+        """Return the compiled queries for one store of the collection."""
         found: list[Compiled] = []
         for query in self.queries:
             ready = query if query.steps else rewritten(query, whole.catalog)
@@ -99,14 +99,14 @@ class Parted:
         return tuple(found)
 
     def statement(self, catalog: Catalog) -> tuple[str, tuple[Any, ...]]:
-        """Return the SQL that merges the results of all stores, and its parameter values."""
+        """Return the SQL that merges the results of the stores, and its parameter values."""
         values = BoundValues()
         text = self.merge(catalog, values)
         return text, tuple(values.items)
 
 
 def parted(compiled: Compiled, form: str = "rows", before: int = 0, after: int = 0) -> Parted:
-    """Return the queries for each store of a collection, with the rule that merges their results.
+    """Return the queries that each store of a collection runs, and the rule to merge the results.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ LISTED: Final = frozenset({"stddev", "median", "percentile", "collect"})
 
 
 def _refuse_strange(result: Result) -> None:
-    """Raise an error if the result clause has a setting without a rule for merging stores."""
+    """Raise an error if results of stores cannot be merged because of a setting of the result clause."""
     for one in fields(result):
         if one.name not in MERGED and getattr(result, one.name) != one.default:
             raise QueryError(
@@ -178,7 +178,7 @@ def _refuse_strange(result: Result) -> None:
 
 
 def _frames(query: Query) -> Query:
-    """Return a query for the matching frames with log times.
+    """Return a query for the matching frames and their log times.
 
     With ``LIMIT``, it returns the frame of each row.
     """
@@ -226,7 +226,7 @@ Placed = tuple[Terms, Terms, str]
 
 
 def _chosen(result: Result, select: Select, placed: Placed, pers: tuple[Terms, Terms]) -> str:
-    """Return SQL that sorts, samples and limits the merged rows.
+    """Return SQL that sorts, samples and limits the rows of all stores.
 
     ``pers``: the ``PER`` columns of ``SAMPLE`` and those of ``LIMIT … PER``.
     """
@@ -247,7 +247,7 @@ def _chosen(result: Result, select: Select, placed: Placed, pers: tuple[Terms, T
 
 
 def _of_part(result: Result) -> Result:
-    """Return the result clause for one store of a collection, with enough rows for the final selection.
+    """Return the result clause for one store, so that the rows suffice for the result of the collection.
 
     A sample of one part can differ from the sample of the collection, so a limited number of its rows is not
     enough.
@@ -262,7 +262,7 @@ def _of_part(result: Result) -> Result:
 
 
 def _bindings(query: Query, hidden: _Hidden) -> Terms:
-    """Return sort keys for the rows of one frame: the nodes and edges that identify a match.
+    """Return the sort keys for matches of the same frame: the nodes and edges of the match.
 
     A store sorts relations by their enumeration, but returns them as texts.
     """
@@ -291,27 +291,27 @@ def _per(result: Result, chosen: Sampling | None, hidden: _Hidden) -> Terms:
 
 
 def _value_of(result: Result, per: Bound | str) -> Bound | str:
-    """Return the expression of a result column, given by name. Return expressions unchanged."""
+    """If a column is given by name, return its expression; return an expression unchanged."""
     if not isinstance(per, str):
         return per
     return next((column.value for column in result.columns if column.name == per), per)
 
 
 class _Hidden:
-    """Columns that the stores of a collection return only for sorting and grouping."""
+    """Columns that the stores of a collection return only because rows are sorted or grouped by them."""
 
     def __init__(self, first: int = 0) -> None:
         self.columns: list[ReturnColumn] = []
         self._numbers = count(first)
 
     def add(self, value: Bound) -> str:
-        """Add a hidden column for a value, and return its quoted name."""
+        """Add a hidden column for a value. Return its quoted name."""
         column = ReturnColumn(f":{next(self._numbers)}", value)
         self.columns.append(column)
         return quoted(column.name)
 
     def key(self, value: Bound | str) -> str:
-        """Return the quoted column of a sort key: a result column, or a new hidden column."""
+        """Return the quoted column of a sort key. Add a hidden column unless it is a result column."""
         return quoted(value) if isinstance(value, str) else self.add(value)
 
 
@@ -377,7 +377,7 @@ def _in_names(
     bound: tuple[Catalog, BoundValues],
     owners: Mapping[str, str],
 ) -> str:
-    """Return SQL that sorts merged rows: by query order, then by columns, with ``run2`` before ``run10``.
+    """Return SQL that sorts the rows of all stores: by ``ORDER BY``, then by the result columns.
 
     ``owners``: the columns with the owners of the nodes in a column.
     """
@@ -396,7 +396,7 @@ def _in_names(
 
 
 class _Grouping:
-    """Split of a query with aggregates into one query per store, and the SQL that merges the results.
+    """Split of a query with aggregates: one query per store, and SQL that combines their results.
 
     The first query for a part has a column for each grouping value, and one or two summable columns for each
     aggregate. An aggregate over *distinct* values needs its own query, which returns the set of values for
@@ -453,7 +453,7 @@ class _Grouping:
         return self._text(column.value)
 
     def _text(self, value: Bound) -> Bound:
-        """Return an expression with columns of merged results in place of aggregates and grouping values."""
+        """Return an expression in which columns of the stores' results replace aggregates and group values."""
         match value:
             case GroupKey(name=name):
                 return EdgeRelation(self._keys[name])
@@ -463,7 +463,7 @@ class _Grouping:
                 return with_operands(value, self._text)
 
     def _number(self, number: Aggregate) -> str:
-        """Return the SQL of an aggregate over a collection, computed from the results of its stores."""
+        """Return the SQL of an aggregate over a collection, from the results of its stores."""
         if number not in self._known:
             self._known[number] = self._merged(number)
         return self._known[number]
@@ -496,7 +496,7 @@ class _Grouping:
         return name
 
     def _each(self, number: Aggregate) -> str:
-        """Return the SQL column of an aggregate that needs all values of the stores, or all distinct values."""
+        """Return the SQL column of an aggregate that needs each value (or distinct value) of all stores."""
         assert number.operand is not None  # noqa: S101 - COUNT(*) alone has none
         hidden = _Hidden(2_000)
         value = hidden.add(number.operand)
@@ -529,7 +529,7 @@ class _Grouping:
         return name
 
     def _every(self, catalog: Catalog, values: BoundValues) -> str:
-        """Return SQL for the result rows of all stores: partial aggregates, and aggregates over all values."""
+        """Return SQL for the result rows of all stores, with partial aggregates or single values."""
         rows = [Select(["*"], [quoted(PARTS)]).text()]
         rows += [text(catalog, values) for _, text in self._more]
         return "\nUNION ALL BY NAME\n".join(f"({text})" for text in rows)
@@ -539,7 +539,7 @@ _PLACE: Final = '":place"'
 
 
 def _sql(value: Bound, values: BoundValues) -> str:
-    """Return the SQL of an expression that already contains SQL columns."""
+    """Return the SQL of an expression that contains SQL columns instead of attributes."""
 
     def leaf(found: Any) -> str:
         return found.edge

@@ -1,4 +1,4 @@
-"""Selection of the stores of a collection that may have matches, by their triples, kinds and classes."""
+"""Selection of the stores of a collection that may have matches of a query."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _WITNESSES: Final = 32
 
 
 class Pruning:
-    """Filter for the stores of a collection that may have matches, by their triples and node kinds.
+    """Filter for stores of a collection. It skips a store whose relations or kinds exclude a match.
 
     A triple is relation, kind and kind.
 
@@ -65,11 +65,11 @@ class Pruning:
         ]
 
     def matters(self, triple: Triple) -> bool:
-        """True if a pattern edge of the query can match a triple (relation, source kind, destination kind)."""
+        """True if an edge of the query can match a triple (relation, source kind, destination kind)."""
         return any(True for of in self._edges for _ in possible(*of, (triple,)))
 
     def may_answer(self, held: frozenset[Triple], kinds: Sequence[frozenset[str]]) -> bool:
-        """True if a store may have a match, according to its triples and node kinds.
+        """True if the triples and node kinds of a store do not exclude a match.
 
         Parameters
         ----------
@@ -90,7 +90,7 @@ class Pruning:
         return known
 
     def _possible(self, every: frozenset[Any]) -> bool:
-        """True if the query can match in a store that has these triples and node kinds."""
+        """True if the query can have a match in a store with these triples and node kinds."""
         triples = [one for one in every if isinstance(one, tuple)]
         return any(
             all(s.where != (FALSE,) and kinds_left(s, triples, every) is not None for s in scopes)
@@ -98,7 +98,7 @@ class Pruning:
         )
 
     def _least(self, every: frozenset[Any]) -> frozenset[Any]:
-        """Return a minimal set of triples and node kinds with which the query can still match."""
+        """Return a smallest set of triples and node kinds that still allow a match."""
         for one in every:
             if self._possible(every - {one}):
                 every -= {one}
@@ -107,7 +107,7 @@ class Pruning:
 
 @dataclass(frozen=True, slots=True)
 class ClassQuestion:
-    """Reference to frame classes in a query. They must be collected from all stores of a collection.
+    """Frame classes that a query needs from all stores of a collection.
 
     Attributes
     ----------
@@ -127,7 +127,7 @@ class ClassQuestion:
 
 
 def class_questions(asked: Query | BoundCheck) -> tuple[ClassQuestion, ...]:
-    """Return the uses of frame classes in a query or a check, without duplicates."""
+    """Return the frame classes that a query or a check needs, each once."""
     if isinstance(asked, BoundCheck):
         values = [asked.formula, *(q.where for q in asked.quantifiers if q.where is not None)]
         values += [*asked.scope.where, *([] if asked.reset is None else [asked.reset])]

@@ -1,4 +1,4 @@
-"""Query patterns generated from an example frame: they describe the surroundings of the ego.
+"""Query patterns generated from an example frame. They describe the surroundings of the ego.
 
 The pattern describes the place of the ego and the traffic related to it: the minimum number of entities of
 each kind at each place. The place is relative to the ego and to its lane, the neighbouring lanes and the
@@ -81,7 +81,7 @@ def _left(ignored: Sequence[str]) -> tuple[frozenset[str], frozenset[str]]:
 
 
 class _Around:
-    """Surroundings of the ego in an example scene graph."""
+    """Surroundings of the ego in the scene graph of an example frame."""
 
     def __init__(
         self, graph: SceneGraph, ego: int, relations: frozenset[str], kinds: frozenset[str]
@@ -102,7 +102,7 @@ class _Around:
                 self._in.setdefault(src, set()).add(dst)
 
     def of_ego(self) -> Iterator[str]:
-        """Yield conditions, as query text, on the place of the ego."""
+        """Yield conditions on the ego's place, as query text."""
         yield from self._places("ego", self._ego)
 
     def others(self) -> list[int]:
@@ -111,7 +111,7 @@ class _Around:
         return [n for n in self._graph.nodes if n in ends and self._kind(n) in self._kinds]
 
     def block(self, node: int) -> str:
-        """Return a pattern in braces for an entity: its kind, relations to the ego, lanes and places."""
+        """Return a pattern in braces that describes an entity: kind, relations to the ego, lanes, places."""
         relations = [r for r in RELATIONS if (node, r, self._ego) in self._edges]
         first, *more = relations
         paths = [f"{node_of_kind(self._kind(node), 'x')}-[:{first}]->(ego)"]

@@ -1,4 +1,4 @@
-"""Hints for error messages: syntax of other languages, and unknown names. The texts are in ``hints.toml``."""
+"""Hints for error messages: words of other query languages, and unknown names. See ``hints.toml``."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ def _tables() -> dict[str, Any]:
 
 @cache
 def _words(table: str, of: str) -> Mapping[str, str]:
-    """Return one table of ``hints.toml``: word in lower case without underscores → hint."""
+    """Return one table of ``hints.toml``: normalised word (no capitals, no ``_``) → hint."""
     told = _tables()[table][of].items()
     return {normalize_name(w.replace(" ", "_")): meant for meant, words in told for w in words}
 
 
 def said_of(of: str, word: str) -> str | None:
-    """Return the hint for a word from another query language, or None.
+    """If a word belongs to another query language, return a hint; otherwise None.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ def said_of(of: str, word: str) -> str | None:
 
 
 def places(names: Container[str]) -> frozenset[str]:
-    """Return types of a place in a query, such as ``label`` or ``comma``, from the terminals allowed there.
+    """Return what a query may have at a place, such as ``label`` or ``comma``, from the allowed terminals.
 
     The kinds are ``edge`` (or the end of a pattern), ``value`` (or a condition), ``operator`` (after a
     value), ``time`` (a duration), ``number``, ``label``, ``name``, ``within`` (inside an edge), ``start`` (of
@@ -107,7 +107,7 @@ _ODD: Final = {
 def slip_hint(
     text: str, start: int, end: int, at: frozenset[str], words: Iterable[str]
 ) -> str | None:
-    """Return a hint for an unexpected part of a query text, or None.
+    """If a part of a query text is not allowed there, return a hint, or None without one.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def slip_hint(
 
 
 def _looked(table: str, before: str, text: str, end: int, at: frozenset[str]) -> str | None:
-    """Return the hint of the first table row that fits the query text at a position, or None."""
+    """Return the hint of the first row in a table of hints that fits the query text at a position."""
     flags = re.IGNORECASE | re.DOTALL
     for looks, hint, *where in _tables()[table]:
         place, then = (*where, "", "")[:2]
@@ -148,7 +148,7 @@ def _looked(table: str, before: str, text: str, end: int, at: frozenset[str]) ->
 
 
 def _character(found: str, at: frozenset[str]) -> str | None:
-    """Return a hint for a character that is not allowed in queries, or not at this place; otherwise None."""
+    """If a query cannot have a character at its place, return a hint, or None without one."""
     if found in {"'", '"'}:
         return "the text in quotes is not closed"
     if found[:1] in {"'", '"'}:
@@ -171,7 +171,7 @@ def _unknown_letter(found: str, at: frozenset[str]) -> str | None:
 
 
 def _like(word: str, keywords: Iterable[str]) -> str | None:
-    """Return the most similar keyword with the same first letter, or None."""
+    """Return the keyword that is most similar to a word and has the same first letter, or None."""
     like = (
         suggestion(word.upper(), [w for w in keywords if w.isalpha()]) if word.isalpha() else None
     )
@@ -179,7 +179,7 @@ def _like(word: str, keywords: Iterable[str]) -> str | None:
 
 
 def _joined(found: str, before: str, at: frozenset[str]) -> str | None:
-    """Return a hint for a word directly after a value: a misspelt keyword, or a missing comma or ``AND``."""
+    """If a word directly follows a value, return a hint: a wrong keyword, or no comma or ``AND`` between."""
     last = re.search(r"(\w+)\s*$", before)
     if last and (like := _like(last[1], _PREFIXES)):
         return f"did you mean {like}?"
@@ -196,7 +196,7 @@ _WORDS: Final = frozenset(
 
 
 def hint_at(name: str, known: Iterable[str]) -> str | None:
-    """Return a hint for an unknown name: the most similar known name, or a list of known names.
+    """Return a hint for an unknown name: the most similar known name, or all known names.
 
     A list keeps its order, so that common names can come first. A set is sorted.
     """
@@ -214,14 +214,14 @@ def hint_at(name: str, known: Iterable[str]) -> str | None:
 
 
 def _short_for(name: str, names: list[str]) -> str | None:
-    """Return the longest known name that is the beginning of the given name, or None."""
+    """Return the longest known name with which the given name begins, or None."""
     whole = normalize_name(name)
     found = [n for n in names if len(n) >= 3 and whole.startswith(normalize_name(n))]
     return max(found, key=len, default=None)
 
 
 def bracket_hint(text: str, position: int, found: str) -> str | None:
-    """Return a hint for an unmatched bracket in a query, with the place of the opening bracket, or None.
+    """If a query has an unmatched bracket, return a hint with its place; otherwise None.
 
     Parameters
     ----------
@@ -257,7 +257,7 @@ _EXCERPT: Final = 24
 
 
 def variable_hint(name: str, visible: Iterable[str], elsewhere: bool) -> str | None:  # noqa: FBT001
-    """Return a hint for an unknown variable, which may be an attribute or a text without quotes; or None.
+    """If an unknown variable may be an attribute or a text without quotes, return a hint; otherwise None.
 
     Parameters
     ----------
@@ -285,7 +285,7 @@ def variable_hint(name: str, visible: Iterable[str], elsewhere: bool) -> str | N
 
 
 def condition_hint(found: Type, written: str) -> str | None:
-    """Return a hint for a query with a plain value where a condition is required, or None.
+    """If a query has a value where it needs a condition, return a hint, or None without one.
 
     Parameters
     ----------
@@ -306,7 +306,7 @@ def condition_hint(found: Type, written: str) -> str | None:
 
 
 def comparison_hint(left: Type, right: Type, texts: Iterable[object]) -> str | None:
-    """Return a hint for a comparison of values of different types, or None.
+    """If a comparison has values of different types, return a hint, or None without one.
 
     Parameters
     ----------
@@ -327,7 +327,7 @@ def comparison_hint(left: Type, right: Type, texts: Iterable[object]) -> str | N
 
 
 def _number_hint(value: object) -> str | None:
-    """Return a hint for a quoted number, a number with a unit, or a text without quotes; otherwise None."""
+    """Return a hint for a number in quotes, a number with a unit, or a text without quotes; or None."""
     if isinstance(value, int | float):
         return f"write a text in quotes: '{value}'"
     found = re.fullmatch(r"\s*([-+]?\d+(?:\.\d+)?)\s*([a-z°/²%]*)\s*", str(value), re.IGNORECASE)

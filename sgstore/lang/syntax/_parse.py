@@ -47,7 +47,7 @@ class Token:
 
 @dataclass(slots=True)
 class _StackEntry:
-    """Entry of the parser stack: the parser state after a symbol, its result, and its place in the text."""
+    """Entry of the parser stack: the parser state, the result of a symbol, and the symbol's place."""
 
     state: int
     value: Any
@@ -55,7 +55,7 @@ class _StackEntry:
 
 
 def parse(text: str) -> tuple[Statement, ...]:
-    """Return the syntax trees of the statements in a query text. Results for short texts are cached.
+    """Parse a query text, and return the syntax trees of its statements. Short texts are cached.
 
     Raises
     ------
@@ -88,7 +88,7 @@ _parsed_once = lru_cache(maxsize=64)(_parsed)
 
 
 def joined(texts: Sequence[str]) -> str:
-    """Join several query texts into one text of statements. A single text stays unchanged.
+    """Join several query texts to one text with all their statements. A single text stays unchanged.
 
     Raises
     ------
@@ -102,7 +102,7 @@ def joined(texts: Sequence[str]) -> str:
 
 
 def _read(machine: Tables, stack: list[_StackEntry], text: str, position: int) -> Token:
-    """Return the next token of the query text that the current parser state allows."""
+    """Return the next token of the query text. The parser state determines the allowed tokens."""
     actions = machine.states[stack[-1].state]
     allowed = [machine.terminals[name] for name in actions if name in machine.terminals]
     while True:
@@ -125,7 +125,7 @@ def _read(machine: Tables, stack: list[_StackEntry], text: str, position: int) -
 
 
 def _reads_as_edge(text: str, position: int, actions: Mapping[str, int]) -> bool:
-    """True if two dashes at this place of the query are an edge, and not the start of a comment."""
+    """True if ``--`` at this place of the query is an edge, and not the start of a comment."""
     if text.startswith("-->", position):
         return True
     behind = text[position - 1 : position] == ")" or text.startswith("--[", position)
@@ -140,7 +140,7 @@ _CLOSING: Final = "RPAR"
 
 
 def _take(machine: Tables, stack: list[_StackEntry], token: Token, text: str) -> None:
-    """Process one token in the parser: reduce all finished grammar rules, then push the token."""
+    """Process a token: complete all grammar rules that end before it, then put it on the stack."""
     before = [*stack]
     while True:
         action = machine.states[stack[-1].state].get(token.name)
@@ -171,7 +171,7 @@ def _reduce(machine: Tables, stack: list[_StackEntry], rule: Rule, text: str) ->
 
 
 def _children(rule: Rule, parts: list[_StackEntry]) -> list[Any]:
-    """Return the values of a grammar rule's parts: no signs, flat lists, ``None`` for absent parts."""
+    """Return the values of a grammar rule's parts: flat lists, and None for absent parts."""
     children: list[Any] = []
     for index, part in enumerate(parts):
         if rule.absent:
@@ -264,7 +264,7 @@ def _unexpected(
 
 
 def _shown(found: str) -> str:
-    """Return a part of the query text for an error message: shortened, with all characters visible."""
+    """Return part of the query text for an error message: short, and with all characters visible."""
     if not found.isprintable():
         return " ".join(f"U+{ord(character):04X}" for character in found[:8])
     short = found if len(found) <= _LONGEST else f"{found[:_LONGEST]}…"
@@ -272,7 +272,7 @@ def _shown(found: str) -> str:
 
 
 def _leads_on(machine: Tables, stack: list[_StackEntry], name: str) -> bool:
-    """True if the parser would accept a terminal as the next one."""
+    """True if the parser accepts a terminal as the next one."""
     states = [entry.state for entry in stack]
     while (action := machine.states[states[-1]].get(name)) is not None:
         if action >= 0:
@@ -286,7 +286,7 @@ def _leads_on(machine: Tables, stack: list[_StackEntry], name: str) -> bool:
 
 
 def _listed(machine: Tables, names: list[str]) -> str:
-    """Return the expected terminals as words for an error message.
+    """Return the terminals that the parser expects as words for an error message.
 
     Operators form a group, as do starts of values.
     """

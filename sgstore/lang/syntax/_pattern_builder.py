@@ -1,4 +1,4 @@
-"""Query patterns built in Python, step by step or from a networkx graph.
+"""Query patterns built in Python, step by step, or from a networkx graph.
 
 Each pattern is converted to query text and parameter values, so it has the meaning of that text.
 """
@@ -25,7 +25,7 @@ _RESERVED: Final = frozenset({"label", "kind", "where", "relation", "name"})
 
 @dataclass(frozen=True, slots=True)
 class Pattern:
-    """Query pattern that is built step by step. Each method returns a new pattern.
+    """Query pattern under construction. Each method returns a new pattern with one more part.
 
     Attributes
     ----------
@@ -125,7 +125,7 @@ class Pattern:
         return self._with(part=f"({ends[0]})-[{inside}]-{'' if both else '>'}({ends[1]})")
 
     def where(self, condition: str, /, **parameters: Any) -> Pattern:
-        """Return a new pattern with an additional condition, written as after ``WHERE``.
+        """Return a new pattern with an additional condition. It has the syntax of ``WHERE``.
 
         Examples
         --------
@@ -136,7 +136,7 @@ class Pattern:
         return self._with(condition=f"({condition})", values=parameters)
 
     def returns(self, what: str, /) -> Pattern:
-        """Return a new pattern with values to return, written as after ``RETURN``.
+        """Return a new pattern that returns the given values. They have the syntax of ``RETURN``.
 
         Examples
         --------
@@ -240,7 +240,7 @@ def _label(label: str) -> str:
 
 
 def _name_of(node: object, number: int) -> str:
-    """Return the variable name for a node: its own name if valid, otherwise ``n`` and a number."""
+    """Return the variable name for a node: its own name if that is valid, otherwise ``n`` and a number."""
     text = str(node)
     return text if _NAME.fullmatch(text) else f"n{number}"
 

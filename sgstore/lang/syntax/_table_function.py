@@ -1,4 +1,4 @@
-"""Replacement of ``sgql('MATCH …')`` (matches) and ``topic('/imu')`` (messages) in SQL by tables.
+"""In SQL, replace ``sgql('MATCH …')`` (matches) and ``topic('/imu')`` (messages) by tables.
 
 The SQL statement is not parsed. Texts, quoted names and comments are skipped, so only real calls are found.
 """
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class PatternTable:
-    """Call ``sgql(…)`` in an SQL statement: the query text and its parameter values.
+    """Call ``sgql(…)`` in SQL: the text of its query, and the values of the query parameters.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ _EXAMPLE: Final = "SELECT * FROM sgql('MATCH (e:Ego) RETURN FRAMES')"
 
 
 def pattern_tables(sql: str, taken: Collection[str] = ()) -> tuple[str, tuple[PatternTable, ...]]:
-    """Replace the calls ``sgql('MATCH …')`` of an SQL statement by table names. Return the SQL and the calls.
+    """Replace each ``sgql('MATCH …')`` in SQL by a table name. Return the new SQL, and the calls.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ TOPIC: Final = ":topic"
 
 
 def topic_tables(sql: str) -> str:
-    """Return an SQL statement in which names of views replace calls such as ``topic('/imu')``.
+    """Replace each call such as ``topic('/imu')`` in SQL by the name of a view, and return the new SQL.
 
     Raises
     ------
@@ -111,7 +111,7 @@ def topic_tables(sql: str) -> str:
 
 
 def topics_in_sql(sql: str) -> list[str]:
-    """Return the topics whose views an SQL statement names, each once.
+    """Return the topics whose views an SQL statement uses, without duplicates.
 
     Examples
     --------
@@ -133,7 +133,7 @@ def _free(taken: Collection[str], number: int) -> str:
 
 
 class _Arguments:
-    """Reader of the arguments of a ``sgql(…)`` call in SQL. It stops after the closing bracket.
+    """Reader of the arguments in ``sgql(…)`` in SQL. It stops after the closing bracket.
 
     Parameters
     ----------
@@ -210,7 +210,7 @@ class _Arguments:
         return tuple(items)
 
     def _value(self) -> Any:
-        """Return the next argument of a ``sgql(…)`` call if it is a constant, otherwise None."""
+        """If the next argument of ``sgql(…)`` is a constant, return its value; otherwise None."""
         found = _VALUE.match(self.sql, self._next())
         if found is None:
             return None

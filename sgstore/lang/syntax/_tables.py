@@ -1,4 +1,4 @@
-"""LALR(1) parser tables of the query grammar, computed once and stored in a file.
+"""Parser tables (LALR(1)) of the query grammar. They are computed once, and stored in a file.
 
 Lark needs about 200 ms to compute the tables of ``grammar.lark``. They are stored in ``grammar.json``, with
 the digest of the grammar, and load in 6 ms. If the file is missing or outdated, the tables are computed again
@@ -25,7 +25,7 @@ _WORD: Final = re.compile(r"\w")
 
 @dataclass(frozen=True, slots=True)
 class Terminal:
-    """Terminal symbol of the query grammar, with its literal or pattern.
+    """Terminal symbol of the query grammar, given by a fixed text or by a pattern.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class Terminal:
     priority: int
 
     def length_at(self, text: str, start: int) -> int:
-        """Return the length of the terminal's match at ``start`` of a text, or 0.
+        """Return the length of the text that the terminal matches from ``start`` on; 0 without a match.
 
         Words must match as a whole.
         """
@@ -60,7 +60,7 @@ class Terminal:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """Rule of the query grammar, in the form that the parser needs to reduce it.
+    """Rule of the query grammar, with all values that the parser needs to apply it.
 
     Attributes
     ----------
@@ -107,7 +107,7 @@ class Tables:
 
 @cache
 def tables() -> Tables:
-    """Return the parser tables of the query grammar, from a file or newly computed."""
+    """Return the parser tables of the query grammar, read from a file or computed."""
     folder = resources.files("sgstore.lang.syntax")
     grammar = folder.joinpath(GRAMMAR).read_text(encoding="utf-8")
     kept = folder.joinpath(TABLES)
@@ -163,7 +163,7 @@ def made_from(grammar: str) -> dict[str, Any]:
 
 
 def _walk(states: dict[int, dict[str, int]], start: int) -> dict[int, int]:
-    """Return new numbers for parser states that depend only on the grammar: old → new.
+    """Return new numbers for parser states, which are the same in each run: old → new.
 
     The old numbers change from run to run.
     """
@@ -230,7 +230,7 @@ def _digest(grammar: str) -> str:
 
 
 def text_of(plain: dict[str, Any]) -> str:
-    """Return parser tables as JSON text, with one state on each line."""
+    """Return parser tables as JSON text. Each state has its own line."""
     states = ",\n".join(json.dumps(state, separators=(",", ":")) for state in plain["states"])
     rest = {key: value for key, value in plain.items() if key != "states"}
     return f'{json.dumps(rest, separators=(",", ":"))[:-1]},\n"states":[\n{states}\n]}}\n'

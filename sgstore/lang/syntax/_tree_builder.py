@@ -1,4 +1,4 @@
-"""Builders of the syntax tree of a query: one function for each grammar rule.
+"""Functions that build the syntax tree of a query: one for each grammar rule.
 
 A builder has the name of its rule, or of the alias of an alternative. It takes the span and the children and
 returns a part of the syntax tree. Signs and keywords are not passed as children. An absent optional part is
@@ -30,7 +30,7 @@ _DURATION: Final = re.compile(r"([\d.]+)\s*(\w+)")
 
 
 class BuildError(Exception):
-    """Error for a query text that matches the grammar, but is not valid."""
+    """Error: a query text fits the grammar, but is not valid."""
 
     def __init__(self, reason: str, span: TextSpan | None = None, hint: str | None = None) -> None:
         self.reason = reason
@@ -62,7 +62,7 @@ def rule_string(span: TextSpan, children: Children) -> s.Constant:
 
 
 def _unquoted(text: str) -> str:
-    r"""Return the text between two quotes, with escapes replaced. Unknown escapes such as ``\d`` stay."""
+    r"""Return the text between two quotes. Known escapes are replaced; others, such as ``\d``, stay."""
     return _ESCAPED.sub(lambda found: _ESCAPES.get(found[1], found[0]), text[1:-1])
 
 
@@ -86,7 +86,7 @@ def _length(text: str, span: TextSpan) -> s.Duration:
 
 
 def rule_window(span: TextSpan, children: Children) -> s.FrameWindow:
-    """Return the syntax tree of a window around a frame: ``-1s..1s``."""
+    """Return the syntax tree of a time window around a frame, such as ``-1s..1s``."""
     before, ahead = (part.strip() for part in children[0].text.strip("-").split(".."))
     return s.FrameWindow(_length(before, span), _length(ahead, span), span)
 
@@ -133,7 +133,7 @@ def _is_topic(owner: s.Expression) -> bool:
 def _topic_field(
     owner: s.TopicExpression | s.Call, part: str | int, place: TextSpan, span: TextSpan
 ) -> s.TopicExpression:
-    """Return the syntax tree of a field of a topic, or of a part of a field."""
+    """Return the syntax tree of a topic's field, or of a part of this field."""
     if isinstance(owner, s.TopicExpression):
         place = TextSpan(owner.path_span.start, place.end)
         return replace(owner, path=(*owner.path, part), path_span=place, span=span)
@@ -164,7 +164,7 @@ _TOPIC_EXAMPLE: Final = "topic('/imu', nearest, 0.1s).linear_acceleration.z"
 
 
 def rule_attribute_in(span: TextSpan, children: Children) -> s.AttributeOf:
-    """Return the syntax tree of ``frame.class('E')``, which means ``frame.class_E``."""
+    """Return the syntax tree of ``frame.class('E')``. It equals that of ``frame.class_E``."""
     owner, name, value = children
     if not (isinstance(owner, s.Variable) and owner.name == "frame" and name.text == "class"):
         hint = said_of("methods", name.text) or f"write the function first: {name.text}(x)"
@@ -298,7 +298,7 @@ _MIRRORED: Final = {
 def _around(
     name: str, operand: s.Expression, place: TextSpan, bound: tuple[Any, Any]
 ) -> s.Temporal | s.Logic:
-    """Return the syntax tree of a temporal operator with frames on both sides: ``EVENTUALLY[-2s, 2s] p``.
+    """Return the syntax tree of a temporal operator with earlier frames: ``EVENTUALLY[-2s, 2s] p``.
 
     It is the operator with the part of the bound ahead, joined with its mirror image for the part before.
     """
@@ -330,7 +330,7 @@ def rule_temporal_pair(_: TextSpan, children: Children) -> s.Temporal:
 
 
 def rule_bound(span: TextSpan, children: Children) -> tuple[Any, Any]:
-    """Return start and end of a time bound: ``[0s, 2s]``, or ``WITHIN 2s``, which starts at 0."""
+    """Return start and end of a time bound: ``[0s, 2s]``; or ``WITHIN 2s``, whose start is 0."""
     (found,) = children
     if isinstance(found, s.Duration | s.Parameter):
         return s.Duration(0, "s", span), found
@@ -469,7 +469,7 @@ def rule_match_step(span: TextSpan, children: Children) -> s.StepClause:
 
 
 def rule_further(_: TextSpan, children: Children) -> tuple[Any, Any]:
-    """Return the paths and the condition of a second ``MATCH`` for the same frame."""
+    """Return the paths and the condition of a ``MATCH`` that follows another one for the same frame."""
     paths, where = children
     return paths, where
 

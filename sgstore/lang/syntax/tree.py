@@ -1,4 +1,4 @@
-"""Classes for the syntax tree of a query. Each part has its position in the text.
+"""Classes for the syntax tree of a query. Each object has its position in the text.
 
 Words are not checked against a vocabulary here; the binder does that. :mod:`sgstore.lang.syntax._parse` makes
 these trees from text.
@@ -39,13 +39,13 @@ class Duration:
 
     @property
     def ns(self) -> int:
-        """Duration in nanoseconds. Not valid for a duration in frames."""
+        """Duration in nanoseconds; 0 for a duration in frames."""
         return round(self.amount * {"ms": 1e6, "s": 1e9, "min": 60e9}.get(self.unit, 0))
 
 
 @dataclass(frozen=True, slots=True)
 class FrameWindow:
-    """Time window around a frame, such as ``-1s..2s``: start ``before`` the frame, end ``ahead`` of it."""
+    """Time window around a frame, such as ``-1s..2s``: from ``before`` it to ``ahead`` of it."""
 
     before: Duration
     ahead: Duration
@@ -150,7 +150,7 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class NullTest:
-    """Null test: ``a IS NULL``, or ``a IS NOT NULL`` if ``negated``."""
+    """Test for NULL: ``a IS NULL``; if ``negated``, ``a IS NOT NULL``."""
 
     operand: Expression
     negated: bool
@@ -159,7 +159,7 @@ class NullTest:
 
 @dataclass(frozen=True, slots=True)
 class Membership:
-    """Membership test: ``a IN list``, or ``a NOT IN list`` if ``negated``."""
+    """Membership test: ``a IN list``; if ``negated``, ``a NOT IN list``."""
 
     operand: Expression
     choices: Expression
@@ -232,7 +232,7 @@ class Temporal:
 
 @dataclass(frozen=True, slots=True)
 class OverExpression:
-    """Aggregate over a match or some of its steps: ``call OVER match``, ``call OVER start..end``."""
+    """Aggregate over a match (``MIN(x) OVER match``) or over some of its steps (``OVER start..end``)."""
 
     call: Expression
     start: Variable | None
@@ -281,7 +281,7 @@ Given = Constant | Duration | Parameter | Variable
 
 @dataclass(frozen=True, slots=True)
 class Label:
-    """Label of a node or edge in a pattern. The name ``%`` means any label."""
+    """Label of a node or edge in a pattern. The label ``%`` matches any."""
 
     name: str
     span: TextSpan
@@ -457,7 +457,7 @@ class ScenarioStep:
 
 @dataclass(frozen=True, slots=True)
 class Argument:
-    """Argument of a scenario call, ``name = value``: a parameter value, or a new name for a variable."""
+    """Argument of a scenario call, ``name = value``: sets a parameter, or renames a variable."""
 
     name: str
     value: Given
@@ -512,7 +512,7 @@ class SequenceClause:
 
 @dataclass(frozen=True, slots=True)
 class LaterMatch:
-    """Later clause of a query: ``OPTIONAL MATCH …``, or ``MATCH …`` after ``OPTIONAL MATCH`` or ``WITH``."""
+    """``OPTIONAL MATCH …``, or a ``MATCH …`` after ``OPTIONAL MATCH`` or ``WITH``."""
 
     block: Block
     optional: bool
@@ -544,14 +544,14 @@ class MatchClause:
 
     @property
     def block(self) -> Block:
-        """Graph pattern of the first sequence step. If the step is a scenario, the pattern is empty."""
+        """Graph pattern of the first sequence step; an empty pattern if the step is a scenario."""
         first = self.sequence.steps[0]
         return first.block if isinstance(first, StepClause) else Block((), None, first.span)
 
 
 @dataclass(frozen=True, slots=True)
 class UnionClause:
-    """Union of queries: ``MATCH … UNION MATCH …``, or ``UNION ALL`` if not ``distinct``."""
+    """Union of queries: ``MATCH … UNION MATCH …``; if not ``distinct``, with ``UNION ALL``."""
 
     parts: tuple[MatchClause, ...]
     distinct: bool
@@ -603,7 +603,7 @@ class QuantifierClause:
 
 @dataclass(frozen=True, slots=True)
 class CheckClause:
-    """Check statement, a rule for whole traces.
+    """Check statement: a rule that a whole trace must meet.
 
     ``USING … CHECK name: quantifiers formula RESET WHEN condition ROBUSTNESS RETURN items HAVING condition``.
     """
@@ -623,12 +623,12 @@ Statement = MatchClause | UnionClause | Define | CheckClause
 
 
 def parameters_in(part: object) -> Iterator[str]:
-    """Yield the names of the query parameters (``$name``) in a part of a syntax tree."""
+    """Yield the names of all query parameters (``$name``) in part of a syntax tree."""
     return (one.name for one in parts_of(part) if isinstance(one, Parameter))
 
 
 def parts_of(part: object) -> Iterator[object]:
-    """Yield a part of a syntax tree and all parts inside it."""
+    """Yield part of a syntax tree, and all parts inside it."""
     yield part
     inner = part if isinstance(part, tuple) else ()
     if is_dataclass(part):
