@@ -210,6 +210,24 @@ def test_the_report_of_a_trace_is_kept_and_told(tmp_path) -> None:
     assert [channel["topic"] for channel in kept["channels"]] == ["truth"]
 
 
+def test_the_json_of_an_ingest_has_errors_and_losses_with_their_places(tmp_path) -> None:
+    hurt, bad = damaged(tmp_path), tmp_path / "a_bad.mcap"
+    bad.write_bytes(hurt.read_bytes()[:4])
+    whole = drive(tmp_path / "whole.mcap", frames=3)
+
+    rows = json.loads(sgstore("ingest", tmp_path / "s.db", hurt, bad, whole, "--json").stdout)
+
+    found = {Path(row["file"]).name: row for row in rows}
+    report = StoreFile(tmp_path / "s.db").trace("hurt").report
+    assert "a_bad.mcap" in found["a_bad.mcap"]["error"]
+    assert [found[name]["error"] for name in ("hurt.mcap", "whole.mcap")] == [None, None]
+    assert found["hurt.mcap"]["losses"] == len(found["hurt.mcap"]["losses_at"]) == 1
+    (loss,) = found["hurt.mcap"]["losses_at"]
+    assert loss["reason"] == "the chunk does not match its checksum"
+    assert loss["offset"] == report["losses"][0]["offset"] > 0
+    assert found["whole.mcap"]["losses_at"] == []
+
+
 def test_doctor_says_what_would_be_read_and_what_is_wrong(tmp_path) -> None:
     path = damaged(tmp_path)
     ingest(tmp_path / "s.db", [path])

@@ -136,7 +136,10 @@ def _report_outcomes(outcomes: list[TraceOutcome], out: PrintedRows) -> int:
     totals = {"frames": "frames", "losses": "losses"}
     for report, outcome in zip(reports, outcomes, strict=True):
         report["warnings"] = [*outcome.warnings]
-    out.write(*_with_more(columns, rows, reports, ("scope", "warnings"), out), totals=totals)
+        report["error"] = str(outcome.error) if outcome.error else None
+        report["losses_at"] = [asdict(loss) for loss in outcome.losses]
+    more = ("scope", "warnings", "error", "losses_at")
+    out.write(*_with_more(columns, rows, reports, more, out), totals=totals)
     return code or (LOSS if any(outcome.losses for outcome in outcomes) else 0)
 
 
