@@ -470,10 +470,10 @@ COMMENT ON VIEW main.lanes IS 'One row a lane of a road map. name: road/section/
 CREATE VIEW main.entities AS
 SELECT e.trace_id, e.node_id, e.kind, e.kind || ' ' || e.node_id AS name, e.ident, e.special, e.subkind, e.type_name, e.is_static, e.map_ref,
        t.origin_x + e.x AS x, t.origin_y + e.y AS y, t.origin_z + e.z AS z, degrees(e.heading) AS heading, e.length, e.width, e.height,
-       e.parked, e.lifetime
+       e.parked, e.lifetime, t.name AS trace
 FROM inside.entity e JOIN inside.trace t ON t.trace_id = e.trace_id;
 
-COMMENT ON VIEW main.entities IS 'One row an entity of a trace. ident, type_name: as the simulator has them; is_static: it never moves, and its pose is here; map_ref: the OpenDRIVE signal or object that it is, of a signal that the map does not have the names of the lanes that it applies to; parked: whether a vehicle does not move in the whole trace and is never on a lane for driving, or is static in the simulator; lifetime: 1, 2, …: which of the entities with this ident: an id that returns as another kind, or where it cannot have moved, is a new entity.';
+COMMENT ON VIEW main.entities IS 'One row an entity of a trace. ident, type_name: as the simulator has them; is_static: it never moves, and its pose is here; map_ref: the OpenDRIVE signal or object that it is, of a signal that the map does not have the names of the lanes that it applies to; parked: whether a vehicle does not move in the whole trace and is never on a lane for driving, or is static in the simulator; lifetime: 1, 2, …: which of the entities with this ident: an id that returns as another kind, or where it cannot have moved, is a new entity; trace: name of the recording.';
 
 CREATE VIEW main.payloads AS
 SELECT f.frame_id, c.topic AS channel, p.log_time_ns, (p.log_time_ns - f.log_time_ns) / 1e9 AS offset_s, c.schema, r.uri AS file,

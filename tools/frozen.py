@@ -49,7 +49,7 @@ FRAMES = 60
 
 LEFT_OUT = {
     "payloads": ("file",),
-    **dict.fromkeys(("nodes", "edges", "world_nodes"), ("trace",)),
+    **dict.fromkeys(("nodes", "edges", "world_nodes", "entities"), ("trace",)),
 }
 """Columns that differ from place to place, or that frames have, too."""
 VERBS = """

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib import resources
 from importlib.metadata import version
+from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 import duckdb
@@ -51,8 +52,8 @@ def schema_version() -> str:
 
 
 TEXT: Final = (
-    "1dd5ae585b258bb6ce8ca77ae469040829f80c6da68771f461419ac47af9c2af",
-    "b97bda47e1fdf0a4a970985fd707ae4ee0fa509ef4d7056cbef17b61ee7f0bb5",
+    "00db79f99f65db85dcf5777ebf3fba83757e36344e40df1960edfdd0d557e682",
+    "f21db8c06fd034705d8c91c7bbbda2d746286065caf4d4a8ef58f757bdb5e0a8",
 )
 """Known digests: of the text of ``schema.sql``, and of its statements, whose parsing takes 10 ms."""
 
@@ -114,13 +115,20 @@ def expected(*wider: tuple[str, Tokens]) -> Shape:
 _written: dict[str, Tokens] = {}
 
 
-BEFORE_TRACE: Final = "7535a0e47dd54aff42b430f36fcecb652340d281021f582733125e752a644a4c"
-"""Digest of the older schema, in which ``nodes`` and ``edges`` have no column ``trace``.
+BEFORE_TRACE: Final = {
+    "7535a0e47dd54aff42b430f36fcecb652340d281021f582733125e752a644a4c": (
+        "nodes",
+        "edges",
+        "world_nodes",
+        "entities",
+    ),
+    "b97bda47e1fdf0a4a970985fd707ae4ee0fa509ef4d7056cbef17b61ee7f0bb5": ("entities",),
+}
+"""Digest of an older schema → its views without the column ``trace``.
 
 Such stores are read. The next write adds the column: see :func:`add_trace`.
 """
 
-_WITH_TRACE: Final = ("nodes", "edges", "world_nodes")
 _TRACE: Final = re.compile(
     r" , (t \. name AS trace|n \. trace|t \. name(?= FROM))"
     r"| JOIN inside \. trace t ON t \. trace_id = [bf] \. trace_id(?= JOIN)"
@@ -137,20 +145,22 @@ def add_trace(connection: DuckDBPyConnection, database: str = "") -> None:
     database : str
         Attached store to change. Empty: create temporary views, and do not change the store.
     """
-    if not database:
-        for name in _WITH_TRACE[:2]:
-            connection.execute(f"CREATE OR REPLACE TEMP VIEW {name} AS {expected().views[name]}")
-        return
     where = "WHERE key = 'schema_digest'"
-    info = f"{quoted(database)}.{INSIDE}.store_info"
-    if connection.execute(f"SELECT value FROM {info} {where}").fetchall() != [(BEFORE_TRACE,)]:
+    info = f"{quoted(database)}.{INSIDE}.store_info" if database else f"{INSIDE}.store_info"
+    digests = connection.execute(f"SELECT value FROM {info} {where}").fetchall()
+    names = [name for (digest,) in digests for name in BEFORE_TRACE.get(digest, ())]
+    if not database:
+        for name in names:
+            view = expected().views[name].replace(" main . nodes ", " nodes ")
+            connection.execute(f"CREATE OR REPLACE TEMP VIEW {name} AS {view}")
+    if not names or not database:
         return
     ((before,),) = connection.execute("SELECT current_database()").fetchall()
     connection.execute(f"USE {quoted(database)}; BEGIN TRANSACTION")
-    for name in _WITH_TRACE:
+    for name in names:
         connection.execute(f"CREATE OR REPLACE VIEW main.{name} AS {expected().views[name]}")
     for words in statements():
-        if words[:3] == ("COMMENT", "ON", "VIEW") and words[5] in _WITH_TRACE:
+        if words[:3] == ("COMMENT", "ON", "VIEW") and words[5] in names:
             connection.execute(" ".join(words))
     connection.execute(f"UPDATE {info} SET value = '{schema_digest()}' {where}")
     connection.execute(f"COMMIT; USE {quoted(before)}")
@@ -163,7 +173,7 @@ def _expected_views(connection: DuckDBPyConnection) -> dict[str, Tokens]:
     """
     if not _written:
         views = expected().views | expected().inner
-        views |= {f"{name}:": _TRACE.sub("", views[name]) for name in _WITH_TRACE}
+        views |= {f"{name}:": _TRACE.sub("", views[name]) for name in chain(*BEFORE_TRACE.values())}
         rows = connection.execute(
             "SELECT system.main.json_deserialize_sql(system.main.json_serialize_sql(text))"
             " FROM (SELECT unnest($1::VARCHAR[]) AS text)",
@@ -338,7 +348,7 @@ def other_version(about: dict[str, str]) -> str:
     )
     if held != SCHEMA_VERSION:
         reason = f"a store of version {held}, expected {SCHEMA_VERSION}"
-    elif about.get("schema_digest") not in {schema_digest(), BEFORE_TRACE}:
+    elif about.get("schema_digest") not in {schema_digest(), *BEFORE_TRACE}:
         reason = (
             f"a store of version {held}, but with other tables or views than those of this sgstore"
         )
@@ -368,8 +378,8 @@ def _altered(connection: DuckDBPyConnection, database: str, objects: Objects) ->
 def _any_changed(connection: DuckDBPyConnection, objects: Objects) -> tuple[str, ...]:
     """Return the faults of a store, compared with the current or the older views."""
     views = _expected_views(connection)
-    older = views | {name: views[f"{name}:"] for name in _WITH_TRACE}
-    return min((tuple(_changed(objects, one)) for one in (views, older)), key=len)
+    older = (views | {name: views[f"{name}:"] for name in names} for names in BEFORE_TRACE.values())
+    return min((tuple(_changed(objects, one)) for one in (views, *older)), key=len)
 
 
 _compared: dict[Objects, tuple[str, ...]] = {}
@@ -377,15 +387,18 @@ _compared: dict[Objects, tuple[str, ...]] = {}
 
 _MOST_COMPARED: Final = 64
 
-KNOWN: Final = "c1120163ae1e3e28cff199bb5cd2dcb4d0e6a712c280e3391c9b619a30691b79"
+KNOWN: Final = "b9efbf0ceb2b2eab557a6082c12c812cbaae821f3bb288559446d87768f59a1d"
 """Known digest of a valid store's objects in DuckDB 2. It avoids a comparison of tokens (30 ms).
 
 Objects of other versions are compared token by token.
 """
 
 
-KNOWN_BEFORE_TRACE: Final = "00fb0323a035b16d0080d34433e0e113b97fafec157fc98bc1b7cb7873778ca9"
-"""Known digest of a valid older store, in which ``nodes`` and ``edges`` have no column ``trace``."""
+KNOWN_BEFORE_TRACE: Final = (
+    "fc36e4bd80dd83197ca9c81f34c4fa035e74a4411cfc9337507c05875eceacf4",
+    "f09b4c628038839dbf097859aca1d2b25eeb0b5148de4058bd7d6a75b9be918b",
+)
+"""Known digests of valid older stores, in the order of :data:`BEFORE_TRACE`."""
 
 
 def digest_of(objects: Objects) -> str:
@@ -395,7 +408,7 @@ def digest_of(objects: Objects) -> str:
 
 @lru_cache(maxsize=_MOST_COMPARED)
 def _is_known(objects: Objects) -> bool:
-    return digest_of(objects) in {KNOWN, KNOWN_BEFORE_TRACE}
+    return digest_of(objects) in {KNOWN, *KNOWN_BEFORE_TRACE}
 
 
 def _changed(objects: Objects, views: dict[str, Tokens]) -> Iterator[str]:

@@ -18,7 +18,7 @@ from sgstore.store._edge_counts import counted_edges
 from sgstore.store._engine_errors import EngineError, engine_fault, spill_fault
 from sgstore.store._interrupts import interrupt
 from sgstore.store._rows import BATCH, Batches, Rows
-from sgstore.store._schema import BEFORE_TRACE, INSIDE, add_trace, expected
+from sgstore.store._schema import INSIDE, add_trace, expected
 from sgstore.store._table_files import ParquetTable
 from sgstore.store._temporary_tables import Given, give
 
@@ -130,7 +130,7 @@ class UserSql:
         """Run a function with a connection and the SQL statement, and yield its result."""
 
         def ask(connection: DuckDBPyConnection, until: ExitStack) -> T:
-            if re.search(r"(?i)\btrace\b", self.sql) and _lacks_trace(connection):
+            if re.search(r"(?i)\btrace\b", self.sql):
                 with self._refused(connection):
                     add_trace(connection)
             counted = None if self._given else counted_edges(self.sql)
@@ -252,12 +252,6 @@ def _check(connection: DuckDBPyConnection, sql: str) -> None:
             f"the store is read only here: {kind} is not allowed; expected SELECT, WITH, FROM, VALUES,"
             f" DESCRIBE, SHOW, SUMMARIZE or EXPLAIN{more}"
         )
-
-
-def _lacks_trace(connection: DuckDBPyConnection) -> bool:
-    """True if the store is so old that the views ``nodes`` and ``edges`` have no column ``trace``."""
-    sql = f"SELECT 1 FROM {INSIDE}.store_info WHERE key = 'schema_digest' AND value = $1"
-    return bool(connection.execute(sql, [BEFORE_TRACE]).fetchall())
 
 
 def _views(_: re.Match[str]) -> str:

@@ -35,7 +35,8 @@ VIEWS = {
     "roles": "frame_id node_id role",
     "classes": "frame_id abstraction class",
     "lanes": "map node_id name lane_type road section lane junction turn x y z heading length width",
-    "entities": "trace_id node_id kind name ident special subkind type_name is_static map_ref",
+    "entities": "trace_id node_id kind name ident special subkind type_name is_static map_ref"
+    " x y z heading length width height parked lifetime trace",
     "events": "frame_id trace_id trace kind time_ns t log_time_ns node_id other value detail ident other_ident",
     "imports": "frame_id graph place images",
     "attributes": "frame_id node_id name text value",
@@ -147,48 +148,64 @@ def test_the_objects_of_a_store_are_those_that_are_known_by_their_digest(tmp_pat
     assert known == found, "SGSTORE_UPDATE_GOLDEN=1 writes it"
 
 
-def without_trace(path: Path) -> None:
-    """Make a store one of before the views ``nodes`` and ``edges`` had the column ``trace``."""
+def without_trace(path: Path, digest: str) -> None:
+    """Make a store an older one, whose views have no column ``trace``."""
     with duckdb.connect(str(path)) as connection:
-        for name in shape._WITH_TRACE:
+        for name in shape.BEFORE_TRACE[digest]:
             text = shape._TRACE.sub("", shape.expected().views[name])
             assert text != shape.expected().views[name]
             connection.execute(f"CREATE OR REPLACE VIEW main.{name} AS {text}")
         connection.execute(
             "UPDATE inside.store_info SET value = ? WHERE key = 'schema_digest'",
-            [shape.BEFORE_TRACE],
+            [digest],
         )
 
 
-def test_nodes_and_edges_of_an_older_store_have_the_trace_and_a_write_adds_it(
-    tmp_path: Path, town_store: Path
+def test_views_with_a_trace_id_or_nodes_have_the_trace(empty: duckdb.DuckDBPyConnection) -> None:
+    rows = empty.execute(
+        "SELECT table_name, list(column_name) FROM duckdb_columns() WHERE schema_name = 'main' GROUP BY 1"
+    ).fetchall()
+
+    lacking = {name for name, columns in rows if "trace_id" in columns and "trace" not in columns}
+    assert (len(rows) > 20, lacking) == (True, set())
+
+
+@pytest.mark.parametrize("digest", shape.BEFORE_TRACE)
+def test_views_of_an_older_store_have_the_trace_and_a_write_adds_it(
+    digest: str, tmp_path: Path, town_store: Path
 ) -> None:
     path = Path(shutil.copy(town_store, tmp_path / "old.sgstore"))
-    without_trace(path)
+    views = shape.BEFORE_TRACE[digest]
+    without_trace(path, digest)
     counts = "SELECT trace, count(*) FROM {} GROUP BY trace"
     store = sgstore.open(path)
-    found = [store.sql(counts.format(view)).values for view in ("nodes", "edges")]
-    plain = [store.sql(f"SELECT count(*) FROM {view}").values for view in ("nodes", "edges")]
+    found = [store.sql(counts.format(view)).values for view in views]
+    plain = [store.sql(f"SELECT count(*) FROM {view}").values for view in views]
 
     assert found == [[("town", count)] for ((count,),) in plain]
     assert list(store.file.verify().faults) == []
     store.file.remove("town")
     store.close()
     with duckdb.connect(str(path), read_only=True) as connection:
-        assert connection.execute(counts.format("edges")).fetchall() == []
+        for view in views:
+            assert connection.execute(counts.format(view)).fetchall() == []
         objects = shape.objects_of(connection, shape.database_of(connection))
         assert [*shape._changed(objects, shape._expected_views(connection))] == []
     assert list(sgstore.open(path).file.verify().faults) == []
 
 
 @pytest.mark.skipif(duckdb.__version__ < "2", reason="this version's words are compared")
-def test_the_objects_of_an_older_store_are_known_by_their_digest(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("digest", "known"), [*zip(shape.BEFORE_TRACE, shape.KNOWN_BEFORE_TRACE, strict=True)]
+)
+def test_the_objects_of_an_older_store_are_known_by_their_digest(
+    digest: str, known: str, tmp_path: Path
+) -> None:
     StoreFile.create(tmp_path / "s.db").close()
-    without_trace(tmp_path / "s.db")
+    without_trace(tmp_path / "s.db", digest)
     with duckdb.connect(str(tmp_path / "s.db"), read_only=True) as connection:
         found = shape.digest_of(shape.objects_of(connection, "s"))
 
-    known = shape.KNOWN_BEFORE_TRACE
     if "SGSTORE_UPDATE_GOLDEN" in os.environ:
         source = Path(shape.__file__)
         source.write_text(source.read_text().replace(known, found))
