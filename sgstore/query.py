@@ -1222,8 +1222,8 @@ class Store(StoreVerbs):
         --------
         >>> for run in store.like("town#264", limit=2):
         ...     print(run)
-        <SimilarFrames from 'town#264': 1 frames, similarity 1>
-        <SimilarFrames from 'town#265': 1 frames, similarity 0.916>
+        <SimilarFrames from 'town#264': 1 frame, similarity 1>
+        <SimilarFrames from 'town#265': 1 frame, similarity 0.916>
         """
         from sgstore.store import Example
 

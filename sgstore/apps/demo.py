@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from sgstore.base.display import number_of
 from sgstore.draw import check_installed
 from sgstore.errors import ExportError, MissingExtraError, TraceError
 from sgstore.exporters import Export, WrittenClip, parse_mounts, write_export
@@ -134,7 +135,7 @@ def _answer(
     say("")
     matches = store.find(pattern)
     found = list(matches.intervals())
-    say(f"  {matches.count()} frames:")
+    say(f"  {number_of(matches.count(), 'frame')}:")
     for interval in found:
         who = ", ".join(_bound(interval))
         say(f"  {interval.start:6.1f} s to {interval.end:4.1f} s   {who}")
@@ -182,7 +183,9 @@ def _export(store: Store, folder: Path, say: Say) -> Path:
     for clip in written:
         seconds = (clip.end_ns - clip.start_ns) / 1e9
         messages = sum(channel.messages for channel in clip.messages)
-        say(f"  {clip.file}: {seconds:.1f} s, {messages} messages, those of sensors among them")
+        say(
+            f"  {clip.file}: {seconds:.1f} s, {number_of(messages, 'message')}, those of sensors among them"
+        )
     return written[0].file
 
 

@@ -36,6 +36,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 import pytest
 
+from sgstore.base.display import number_of
 from sgstore.errors import SgstoreError
 
 if TYPE_CHECKING:
@@ -260,8 +261,8 @@ def violations_text(verdict: Verdict) -> str:
     for one in verdict.violations:
         who = ", ".join(map(str, one.values.values()))
         lines.append(
-            f"  #{one.start_seq}-{one.end_seq}, {one.start:.3f} to {one.end:.3f} s, {one.frames} frames"
-            + f": {who}" * bool(who)
+            f"  #{one.start_seq}-{one.end_seq}, {one.start:.3f} to {one.end:.3f} s,"
+            f" {number_of(one.frames, 'frame')}" + f": {who}" * bool(who)
         )
     return "\n".join(lines)
 

@@ -36,6 +36,15 @@ def cell(value: Any, longest: int = LONGEST) -> str:
     return text if len(text) <= longest else f"{text[: longest - 1]}…"
 
 
+def number_of(number: int, what: str, more: str = "s") -> str:
+    """Return a count with its noun; ``more`` is the plural suffix.
+
+    >>> number_of(1, "frame"), number_of(2000, "frame"), number_of(2, "match", "es")
+    ('1 frame', '2,000 frames', '2 matches')
+    """
+    return f"{number:,} {what}{'' if number == 1 else more}"
+
+
 def text_table(columns: Sequence[str], rows: Sequence[Sequence[Any]], below: str = "") -> str:
     """Return a table as lines of text, with a text below it. Numbers are right-aligned."""
     texts = [[str(name) for name in columns], *([cell(value) for value in row] for row in rows)]

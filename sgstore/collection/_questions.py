@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, Final, Self, cast, overload
 
 import numpy as np
 
+from sgstore.base.display import number_of
 from sgstore.base.temporary_folders import working_folder
 from sgstore.collection import _catalogue as catalogue
 from sgstore.collection import _worker as worker
@@ -327,7 +328,7 @@ class Collection(StoreVerbs):
         --------
         >>> fleet = sgstore.open("fleet", engine="local")  # made by 'sgstore collection pack'
         >>> fleet.like("town#264", limit=1)
-        [<SimilarFrames from 'town#264': 1 frames, similarity 1>]
+        [<SimilarFrames from 'town#264': 1 frame, similarity 1>]
         """
         about = {"ref": frame, "name": abstraction, "ignored": [*ignore]}
         example = self._at_home(frame, worker.example_in, about)
@@ -569,7 +570,7 @@ def _facts_of_table(name: str, told: Mapping[str, Any]) -> TableFacts:
     if not told["joins"]:
         refused = "no rows that belong to frames"
     elif told["frames"] != told["matched"]:
-        refused = f"{told['matched']} rows for {told['frames']} frames"
+        refused = f"{number_of(told['matched'], 'row')} for {number_of(told['frames'], 'frame')}"
     columns = {column: Type(kind) for column, kind in told["columns"].items()}
     return TableFacts(name, columns, refused, told["traces"], joins=told["joins"])
 

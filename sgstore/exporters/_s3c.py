@@ -14,6 +14,7 @@ from __future__ import annotations
 import csv
 from typing import TYPE_CHECKING, Final
 
+from sgstore.base.display import number_of
 from sgstore.errors import ExportError
 from sgstore.exporters._clips import WrittenFile
 from sgstore.graphs.abstractions import abstraction_named
@@ -46,7 +47,7 @@ def write(export: Export, folder: Path) -> list[WrittenFile]:
                 for number, edge in enumerate(edges):
                     writer.writerow((trace, f"{trace}#{seq}", 1, number, *edge))
                 rows += len(edges)
-    reason = f"{alone} nodes without an edge are in no row: rows of S3C are edges"
+    reason = f"{number_of(alone, 'node')} without an edge in no row: rows of S3C are edges"
     _test(folder / GRAPHS, rows)
     notes = [reason] if alone else []
     written = [WrittenFile.of(folder / GRAPHS, "rows", rows, notes=notes)]

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
+from sgstore.base.display import number_of
 from sgstore.base.geometry import wrapped
 from sgstore.base.tables import taken
 from sgstore.mcap import Findings, Loss
@@ -253,7 +254,7 @@ class FaultTally:
     def losses(self) -> list[Loss]:
         """Return one report entry for each object attribute with impossible values."""
         reasons = [
-            f"{what} {first}: missing in {count} states"
+            f"{what} {first}: missing in {number_of(count, 'state')}"
             + (f", first in frame {frame}" if frame >= 0 else "")
             for what, (first, count, frame) in self._found.items()
         ]

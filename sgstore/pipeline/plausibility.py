@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
+from sgstore.base.display import number_of
 from sgstore.graphs.online import entities_of
 from sgstore.model.vocabulary import (
     DRIVING,
@@ -352,7 +353,7 @@ class Plausibility:
             ("unsorted stamps", "runs backwards", steps < 0),
         ):
             if times := int(wrong.sum()):
-                value = f"simulation time {words} {times} times"  # as the reader
+                value = f"simulation time {words} {number_of(times, 'time')}"  # as the reader
                 self._events[kind] = _Event(-1, int(wrong.argmax()) + 1, value, times)
         ahead = steps[steps > 0]
         if len(ahead) and not SHORTEST_NS <= (period := int(np.median(ahead))) <= LONGEST_NS:

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 import numpy as np
 
 from sgstore import errors
+from sgstore.base.display import number_of
 from sgstore.base.logs import logger
 from sgstore.base.processes import requests, send_reply
 from sgstore.errors import SgstoreError, TraceError, failure, place_named
@@ -126,9 +127,8 @@ class TraceOutcome:
     error: SgstoreError | None = None
 
     def __repr__(self) -> str:
-        about = (
-            str(self.error) if self.error else f"{self.frames} frames, {len(self.losses)} losses"
-        )
+        about = f"{number_of(self.frames, 'frame')}, {number_of(len(self.losses), 'loss', 'es')}"
+        about = str(self.error) if self.error else about
         return f"<TraceOutcome {self.name or self.path.name!r}: {self.status}, {about}>"
 
     def as_dict(self) -> dict[str, Any]:

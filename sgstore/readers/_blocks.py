@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, Generic, NamedTuple, Typ
 
 import numpy as np
 
+from sgstore.base.display import number_of
 from sgstore.base.tables import chained, taken
 from sgstore.mcap import IDS, Loss
 from sgstore.model.noise import Noise, Smoother, noise_of
@@ -456,10 +457,10 @@ class MessageDecoder(Generic[Raw]):
         losses = self._report.losses
         losses += self._unreadable.losses()
         for loss in self._unusable.losses():  # These losses are states, not messages.
-            reason = f"{loss.reason}: {loss.messages} states were left out"
+            reason = f"{loss.reason}: {number_of(loss.messages, 'state')} left out"
             losses.append(replace(loss, reason=reason, messages=0, bytes=0))
         if self._untimed:
-            words = f"{self._untimed} frames bear no time of their own: their log time is taken"
+            words = f"{number_of(self._untimed, 'frame')} without a time: the log time is used"
             self._report.warnings.append(words)
 
     def is_inside(self, log_time_ns: int) -> bool:
@@ -688,9 +689,9 @@ def counted(blocks: Iterable[FrameBlock], report: TraceReport) -> Iterator[Frame
         last = int(block.time_ns[-1])
         yield block
     if back:
-        report.warnings.append(f"simulation time runs backwards {back} times")
+        report.warnings.append(f"simulation time runs backwards {number_of(back, 'time')}")
     if still:
-        report.warnings.append(f"simulation time stands still {still} times")
+        report.warnings.append(f"simulation time stands still {number_of(still, 'time')}")
 
 
 def _block(
@@ -850,7 +851,7 @@ class LifetimeTracker:
         if self._gaps:
             longest = max(self._gaps) / 1e9
             warnings.append(
-                f"{len(self._gaps)} gaps longer than three periods, the longest {longest:g} s:"
+                f"{number_of(len(self._gaps), 'gap')} longer than three periods, the longest {longest:g} s:"
                 " nothing is derived across them"
             )
 

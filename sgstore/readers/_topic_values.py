@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from sgstore.base.display import number_of
+
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
@@ -102,9 +104,13 @@ class Losses:
         """Return a text for each kind of loss: number of messages, number of values."""
         found: list[str] = []
         if self.messages:
-            found.append(f"{self.messages} messages cannot be decoded, the first: {self.reason}")
+            found.append(
+                f"{number_of(self.messages, 'message')} not decodable, the first: {self.reason}"
+            )
         if self.values:
-            found.append(f"{self.values} values are left out: too large, or of another type")
+            found.append(
+                f"{number_of(self.values, 'value')} left out: too large, or of another type"
+            )
         return found
 
 

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import duckdb
 
+from sgstore.base.display import number_of
 from sgstore.base.quoting import literal
 from sgstore.base.temporary_folders import temporary_folder
 from sgstore.errors import StoreError
@@ -202,7 +203,7 @@ class UserTables:
         single = {
             name: None
             if one.frames == one.matched
-            else f"{one.matched} rows for {one.frames} frames"
+            else f"{number_of(one.matched, 'row')} for {number_of(one.frames, 'frame')}"
             for name, one in self.joined(connection).items()
         }
         found = {

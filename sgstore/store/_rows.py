@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import duckdb
 
+from sgstore.base.display import number_of
 from sgstore.base.json_text import shortest
 from sgstore.base.quoting import quoted
 from sgstore.errors import ExportError, MissingExtraError
@@ -219,7 +220,7 @@ class Rows(Tabular):
     --------
     >>> rows = store.sql("SELECT trace, count(*) AS frames FROM frames GROUP BY trace")
     >>> rows
-    <1 rows of trace, frames>
+    <1 row of trace, frames>
     >>> for row in rows:
     ...     print(row)
     ('town', 750)
@@ -254,7 +255,7 @@ class Rows(Tabular):
 
     def __repr__(self) -> str:
         more = " and more" * self.truncated
-        return f"<{len(self):,} rows{more} of {', '.join(self.columns)}>"
+        return f"<{number_of(len(self), 'row')}{more} of {', '.join(self.columns)}>"
 
     def __str__(self) -> str:
         """Return the first rows of a result as a table of text."""

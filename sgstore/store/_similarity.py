@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from sgstore.base.display import number_of
 from sgstore.errors import AbstractionError
 from sgstore.graphs.abstractions import (
     Classes,
@@ -70,7 +71,8 @@ class SimilarFrames:
 
     def __repr__(self) -> str:
         first = f"{self.frame.trace}#{self.frame.seq}"
-        return f"<SimilarFrames from {first!r}: {self.frames} frames, similarity {self.similarity:.3g}>"
+        frames = number_of(self.frames, "frame")
+        return f"<SimilarFrames from {first!r}: {frames}, similarity {self.similarity:.3g}>"
 
 
 @dataclass(frozen=True, slots=True)

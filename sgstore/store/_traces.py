@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from sgstore.base.display import excerpt
+from sgstore.base.display import excerpt, number_of
 from sgstore.errors import SgstoreError, StoreError, TraceError, place_named, url_named
 from sgstore.model.frame_ids import BUCKET_BITS, FRAME_BITS
 from sgstore.model.pair_numbers import UNEVEN
@@ -218,7 +218,7 @@ class StoredTrace:
         return covered_s(self.start_ns, self.end_ns, self.frames, self.period_ns)
 
     def __repr__(self) -> str:
-        about = f"{self.frames} frames, {self.seconds:.1f} s, ego {self.ego!r}, map {self.map!r}"
+        about = f"{number_of(self.frames, 'frame')}, {self.seconds:.1f} s, ego {self.ego!r}, map {self.map!r}"
         return f"<StoredTrace {self.name!r}: {about}>"
 
     def as_dict(self) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import urlsplit
 
+from sgstore.base.display import number_of
 from sgstore.errors import QueryError, TraceError
 from sgstore.graphs.online import GcPaused, replayed
 from sgstore.lang.bind import (
@@ -317,7 +318,7 @@ class Monitor:
 
     def __repr__(self) -> str:
         seen = 0 if self._last is None else self._last.seq + 1
-        return f"<Monitor of {', '.join(self.names)} after {seen} frames>"
+        return f"<Monitor of {', '.join(self.names)} after {number_of(seen, 'frame')}>"
 
     def _of_scope(self, ego: str | None, *, world: bool) -> tuple[int, QueryCache]:
         """Return the query cache for an ego, and its index. ``world``: also entities outside the graphs."""

@@ -131,7 +131,7 @@ def test_public_objects_say_what_they_are(store: sgstore.Store) -> None:
     assert repr(store.traces()) == (
         "(<StoredTrace 'town': 750 frames, 74.9 s, ego 'ego', map 'town.xodr'>,)"
     )
-    assert repr(store.sql("SELECT 1 AS one, 'x' AS two")) == "<1 rows of one, two>"
+    assert repr(store.sql("SELECT 1 AS one, 'x' AS two")) == "<1 row of one, two>"
     assert repr(store.check("CHECK slow: ALWAYS ego.speed < 14")) == "<CheckRun of slow>"
     assert repr(next(iter(store.check("CHECK still: ALWAYS ego.speed < 0")))) == (
         "<Verdict 'still' of 'town': false, 1 violation>"

@@ -126,7 +126,7 @@ def test_an_object_without_a_usable_pose_is_left_out_and_named(path: Path, broke
     _, blocks, report = read(path)
 
     assert [sorted(frame) for frame in states(blocks)] == [["1", "2"], ["1"], ["1", "2"]]
-    assert "object 2 has no usable pose: 1 states were left out" in reasons(report)
+    assert "object 2 has no usable pose: 1 state left out" in reasons(report)
     assert report.losses[0].start_ns == 102_000_000
 
 

@@ -131,9 +131,9 @@ def test_only_what_is_unusable_is_left_out(had: Had, whole: dict[int, dict[str, 
 
     assert sorted(gone) == [(30, "105"), (60, "110"), *((frame, "503") for frame in range(90, 100))]
     assert sorted(loss.reason.split(": ")[1] for loss in report.losses) == [
-        "1 states were left out",
-        "1 states were left out",
-        "10 states were left out",
+        "1 state left out",
+        "1 state left out",
+        "10 states left out",
     ]
 
 

@@ -261,7 +261,7 @@ def test_entities_without_time_take_the_log_time(file: Path) -> None:
     _, blocks, report = read(file)
 
     assert blocks[0].time_ns.tolist() == [ns(5.0), ns(5.1), ns(5.2)]
-    assert any("3 frames bear no time of their own" in warning for warning in report.warnings)
+    assert any("3 frames without a time" in warning for warning in report.warnings)
 
 
 @pytest.mark.parametrize(

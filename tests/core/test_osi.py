@@ -346,8 +346,8 @@ def test_time_that_stands_still_gives_no_slope(tmp_path: Path) -> None:
 
     assert of(blocks, "1").vx == pytest.approx([10, 10, 10, 10, np.nan], nan_ok=True)
     assert report.warnings[:2] == [
-        "simulation time runs backwards 1 times",
-        "simulation time stands still 1 times",
+        "simulation time runs backwards 1 time",
+        "simulation time stands still 1 time",
     ]
 
 
@@ -363,7 +363,7 @@ def test_a_pose_that_is_no_pose_is_left_out_and_its_entity_named(
     _, blocks, report = read(record(tmp_path / "a.mcap", frames), 2)
 
     (loss,) = report.losses
-    assert loss.reason == "moving object 5 has no usable pose: 2 states were left out"
+    assert loss.reason == "moving object 5 has no usable pose: 2 states left out"
     assert (loss.start_ns, loss.end_ns) == (ns(0.2), ns(0.3))
     assert len(of(blocks, "5")) == 3
     assert len(of(blocks, "4")) == 5
@@ -1055,7 +1055,7 @@ def test_a_frame_without_time_takes_its_log_time(tmp_path: Path) -> None:
     _, blocks, report = read(path)
 
     assert blocks[0].time_ns.tolist() == [ns(0.5)]
-    assert "1 frames bear no time of their own" in report.warnings[0]
+    assert "1 frame without a time" in report.warnings[0]
 
 
 def test_memory_does_not_grow_with_the_length_of_a_recording(tmp_path: Path) -> None:

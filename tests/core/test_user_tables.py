@@ -150,7 +150,7 @@ def test_several_rows_for_a_frame_are_no_attribute_of_it(path, frames, table) ->
     store = sgstore.open(path, tables={"seen": file})
 
     assert len(store.sql("SELECT * FROM seen JOIN frames USING (frame_id)")) == 2
-    with pytest.raises(QueryError, match="it has 2 rows for 1 frames"):
+    with pytest.raises(QueryError, match="it has 2 rows for 1 frame"):
         store.find("MATCH (e:Ego) WHERE seen.what = 'a'")
 
 
@@ -256,7 +256,7 @@ def test_rows_that_belong_to_no_frame_are_told(path, frames, table) -> None:
 
     result = run("sql", path, "SELECT count(*) FROM labels", "--with", file)
 
-    assert "labels: 2 of 3 rows do not refer to a frame of the store" in result.stderr
+    assert "labels: 2 of 3 rows without a frame of the store" in result.stderr
 
 
 @pytest.mark.parametrize("ending", ["csv", "json", "ndjson", "parquet", "arrow"])

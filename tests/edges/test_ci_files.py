@@ -171,7 +171,7 @@ def entries() -> dict[str, tuple[str, str]]:
 @pytest.mark.parametrize(
     ("hook", "name", "text", "code", "reason"),
     [
-        ("sgstore-queries", "a.sgql", RULES, 0, "1 of 1 files have no mistake"),
+        ("sgstore-queries", "a.sgql", RULES, 0, "1 of 1 file without a mistake"),
         ("sgstore-queries", "a.sgql", "MATCH (e:Ego) WHERE e.speed > $x", 0, "no mistake"),
         (
             "sgstore-queries",

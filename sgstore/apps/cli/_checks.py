@@ -28,6 +28,7 @@ from sgstore.apps.cli._options import (
 )
 from sgstore.apps.cli._output import complain, say
 from sgstore.apps.cli._sarif import write_sarif
+from sgstore.base.display import number_of
 from sgstore.errors import SgstoreError
 
 if TYPE_CHECKING:
@@ -122,7 +123,7 @@ def lint(files: list[Path]) -> int:
         except (OSError, UnicodeDecodeError, SgstoreError) as error:
             wrong += 1
             complain(f"{file}: {getattr(error, 'strerror', '') or error}")
-    say(f"{len(files) - wrong} of {len(files)} files have no mistake")
+    say(f"{len(files) - wrong} of {number_of(len(files), 'file')} without a mistake")
     return ERROR if wrong else 0
 
 
@@ -204,7 +205,7 @@ def _draw_violations(store: Store, folder: Path, verdicts: Sequence[Verdict]) ->
         draw_stored(store, f"{one.trace}#{one.start_seq}", file)
         pictures[clip] = file.as_posix()
     if len(spans) > len(pictures):
-        say(f"{len(pictures)} of {len(spans)} violations have a picture")
+        say(f"{len(pictures)} of {number_of(len(spans), 'violation')} with a picture")
     return pictures
 
 

@@ -17,7 +17,8 @@ from sgstore.apps.cli._options import (
     jobs_of,
     seconds_of,
 )
-from sgstore.apps.cli._output import count_bar, number_of, say
+from sgstore.apps.cli._output import count_bar, say
+from sgstore.base.display import number_of
 from sgstore.errors import place_named
 
 if TYPE_CHECKING:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import typer  # noqa: TC002  typer looks the types of these functions up
 
+from sgstore.base.display import number_of
 from sgstore.errors import SgstoreError
 
 if TYPE_CHECKING:
@@ -117,7 +118,7 @@ def channels(ctx: typer.Context) -> Offers:
 
 
 def _about(trace: StoredTrace) -> str:
-    return f"{trace.frames} frames, {trace.seconds:g} s"
+    return f"{number_of(trace.frames, 'frame')}, {trace.seconds:g} s"
 
 
 def _traces(ctx: typer.Context) -> list[StoredTrace]:

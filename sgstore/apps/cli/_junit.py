@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from sgstore.base.display import number_of
 from sgstore.base.output_files import write_bytes
 
 if TYPE_CHECKING:
@@ -104,7 +105,7 @@ def _violations(verdict: Verdict, evidence: Evidence) -> list[str]:
     return [
         _plain(
             f"{one.trace}#{one.start_seq}-{one.end_seq}, {one.start:.3f} to {one.end:.3f} s,"
-            f" {one.frames} frames"
+            f" {number_of(one.frames, 'frame')}"
             + "".join(f", {name} {value}" for name, value in one.values.items())
             + "".join(f"; {name}: {value}" for name, value in evidence.of(one).items())
         )

@@ -91,7 +91,7 @@ import sgstore.apps.cli._completion as completion
 from sgstore.apps.cli._completion import STORE
 from sgstore.apps.cli._output import LONG_TABLE, Format, say, say_json, set_verbosity, write_rows
 from sgstore.apps.cli._process import set_deadline
-from sgstore.base.display import excerpts
+from sgstore.base.display import excerpts, number_of
 from sgstore.base.docstrings import split_docstring
 from sgstore.errors import ConfigError, url_named
 
@@ -671,7 +671,7 @@ class PrintedRows:
         number = write_rows(columns, counted(), self.chosen, self.file, types)
         if number >= LONG_TABLE:
             said = [f"{round(sums[name], 3):,} {unit}" for name, unit in (totals or {}).items()]
-            say(", ".join([f"{number:,} rows", *said]))
+            say(", ".join([number_of(number, "row"), *said]))
         return number
 
     def report(self, table: ReportTable, limit: int | None = 0) -> None:
@@ -684,7 +684,7 @@ class PrintedRows:
         rows = table.rows[:limit] if limit else table.rows
         self.write(table.columns, rows)
         if len(rows) < len(table.rows):
-            say(f"{len(table.rows) - len(rows)} more rows; --limit 0 shows all")
+            say(f"{number_of(len(table.rows) - len(rows), 'more row')}; --limit 0 shows all")
         for text in table.said:
             say(text)
 
@@ -740,7 +740,9 @@ class QueryLimits:
         for name, joined in opened.file.joined().items():
             if joined.matched < joined.rows:
                 lost = joined.rows - joined.matched
-                say(f"{name}: {lost} of {joined.rows} rows do not refer to a frame of the store")
+                say(
+                    f"{name}: {lost} of {number_of(joined.rows, 'row')} without a frame of the store"
+                )
         return opened
 
 
@@ -1070,7 +1072,7 @@ def _scope_text(found: Mapping[str, Any]) -> str:
     """Return one line of text about the data that settings excluded from a store."""
     if not found:
         return ""
-    scope, states = found.get("scope", ""), f"of {found['states']:,} states"
+    scope, states = found.get("scope", ""), f"of {number_of(found['states'], 'state')}"
     parts: list[str] = []
     for of, what, reach in (("graph", "the graphs", "radius"), ("world", "the world", "world")):
         beyond, far = found[f"beyond_{reach}"], found[reach]

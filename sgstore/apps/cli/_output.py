@@ -16,6 +16,7 @@ from enum import StrEnum
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
+from sgstore.base.display import number_of
 from sgstore.base.output_files import BIDIRECTIONAL, without_controls, written_text
 from sgstore.base.temporary_folders import working_folder
 from sgstore.errors import ExportError
@@ -234,11 +235,6 @@ def reset_verbosity() -> None:
 
         logging.getLogger("sgstore").removeHandler(handler)
         logging.getLogger("sgstore").setLevel(logging.NOTSET)
-
-
-def number_of(number: int, what: str, more: str = "s") -> str:
-    """Return a count with its noun, such as ``1 frame`` or ``2 frames``; ``more`` is the plural suffix."""
-    return f"{number:,} {what}{'' if number == 1 else more}"
 
 
 def say(message: str) -> None:
@@ -536,7 +532,7 @@ def _facts(values: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "entities", _counts(values.get("entities", {}))
     yield "unknown types", _counts(values.get("unknown_types", {}))
     for name in ("clock_jumps", "gaps"):
-        if values.get("frames"):
+        if values.get(name):
             yield name.replace("_", " "), _steps(values, name)
     yield "lost", _lost(values.get("losses", []))
     ingested = values.get("ingested_at")
@@ -555,7 +551,7 @@ def _lists(values: dict[str, Any]) -> Iterator[tuple[str, list[str]]]:
         yield (
             "stored topics",
             [
-                f"{name}: {one['messages']} messages, {len(one['fields'])} fields"
+                f"{name}: {number_of(one['messages'], 'message')}, {number_of(len(one['fields']), 'field')}"
                 for name, one in topics.items()
             ],
         )
@@ -607,13 +603,13 @@ def _lost(losses: list[dict[str, Any]]) -> str:
     messages = sum(max(loss["messages"], 0) for loss in losses)
     size = sum(max(loss["bytes"], 0) for loss in losses)
     unknown = any(loss["messages"] < 0 for loss in losses)
-    return f"{'at least ' if unknown else ''}{messages} messages, {_amount(size)}"
+    return f"{'at least ' if unknown else ''}{number_of(messages, 'message')}, {_amount(size)}"
 
 
 def _loss(loss: dict[str, Any]) -> str:
     told = [loss["reason"]]
     if loss["messages"] >= 0:
-        told.append(f"{loss['messages']} messages")
+        told.append(number_of(loss["messages"], "message"))
     if loss["bytes"] >= 0:
         told.append(_amount(loss["bytes"]))
     if loss["start_ns"] >= 0:
@@ -629,7 +625,7 @@ def _channels(channels: Iterable[dict[str, Any]]) -> Iterator[str]:
             channel["topic"],
             channel["schema"] or channel["message_encoding"] or "no schema",
             channel.get("role") or "",
-            f"{channel['messages']} messages" if channel.get("messages", -1) >= 0 else "",
+            number_of(channel["messages"], "message") if channel.get("messages", -1) >= 0 else "",
         )
         for channel in channels
     ]
@@ -643,7 +639,7 @@ def _amount(size: int) -> str:
     for unit, scale in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if size >= scale:
             return f"{size / scale:.1f} {unit}"
-    return f"{size} bytes"
+    return number_of(size, "byte")
 
 
 def _shown(text: str) -> str:

@@ -42,13 +42,13 @@ from sgstore.apps.cli._options import (
 from sgstore.apps.cli._output import (
     BINARY,
     Format,
-    number_of,
     progress,
     say,
     write_binary,
     write_document,
     write_text,
 )
+from sgstore.base.display import number_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -450,7 +450,7 @@ def _sandbox(store: Path, bounds: QueryLimits, limit: int, tables: list[str] | N
 def _say_all(answer: Answer) -> None:
     say_left_out(answer)
     if answer.truncated:
-        say(f"only the first {len(answer.rows)} rows; --limit sets how many")
+        say(f"only the first {number_of(len(answer.rows), 'row')}; --limit sets how many")
 
 
 library = Verbs(

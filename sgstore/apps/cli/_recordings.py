@@ -30,7 +30,7 @@ from sgstore.apps.cli._options import (
     seconds_of,
 )
 from sgstore.apps.cli._output import Format, complain, quiet, say, write_document, write_report
-from sgstore.base.display import excerpts
+from sgstore.base.display import excerpts, number_of
 from sgstore.errors import StoreError, place_named
 
 if TYPE_CHECKING:
@@ -174,7 +174,7 @@ def _land(
     outcomes = land(url_of(store) or store, paths, shard=(int(number), int(of)), **options)
     if shard is not None:
         names = excerpts([one.name or one.path.name for one in outcomes]) or "none"
-        say(f"share {shard} of {len(paths)} recordings: {names}")
+        say(f"share {shard} of {number_of(len(paths), 'recording')}: {names}")
     return outcomes
 
 
@@ -186,7 +186,7 @@ def _say_warnings(outcome: TraceOutcome) -> None:
     if outcome.error:
         complain(str(outcome.error))
     for name, number in outcome.unknown_types.items():
-        say(f"{place_named(outcome.path)}: {number} entities of type {name!r}, {_no_kind(name)}")
+        say(f"{place_named(outcome.path)}: {number} of type {name!r}, {_no_kind(name)}")
     for warning in outcome.warnings:
         say(f"{place_named(outcome.path)}: {warning}")
     for loss in outcome.losses:
@@ -245,13 +245,18 @@ def info(
     reports = [one.report for one in stored]
     say_scope(scope_of(reports, world=None), out.chosen)
     for one in stored:
-        jumps, gaps = one.report.get("clock_jumps", 0), one.report.get("gaps", 0)
-        if jumps or gaps:
-            say(f"{one.name}: clock jumps: {jumps}, gaps: {gaps}; info --trace lists them")
+        counts = {"clock jump": "clock_jumps", "gap": "gaps"}
+        steps = [
+            number_of(count, what)
+            for what, key in counts.items()
+            if (count := one.report.get(key, 0))
+        ]
+        if steps:
+            say(f"{one.name}: {', '.join(steps)}; info --trace lists them")
     topics = Counter(topic for its in file.stored_topics().values() for topic in its)
     if topics:
         each = ", ".join(f"{name} in {number}" for name, number in sorted(topics.items()))
-        say(f"stored topics: {each} of {len(stored)} traces")
+        say(f"stored topics: {each} of {number_of(len(stored), 'trace')}")
     rows = (
         (
             *(one.name, one.frames, round(one.seconds, 3)),
@@ -399,7 +404,9 @@ def record(
         say(warning)
     written = done.written
     seconds = (written.end_ns - written.start_ns) / 1e9
-    say(f"{written.frames} frames, {seconds:.2f} s; sgstore ingest STORE {written.path}")
+    say(
+        f"{number_of(written.frames, 'frame')}, {seconds:.2f} s; sgstore ingest STORE {written.path}"
+    )
     typer.echo(written.path)
     return LOSS if done.dropped else 0
 
@@ -414,7 +421,7 @@ def _counter() -> Generator[Callable[[int, float], None] | None]:
 
     with Console(stderr=True).status("waiting for the first frame") as line:
         yield lambda frames, seconds: line.update(
-            f"{frames} frames, {seconds:.1f} s of simulation; Ctrl-C ends the recording"
+            f"{number_of(frames, 'frame')}, {seconds:.1f} s of simulation; Ctrl-C ends the recording"
         )
 
 
@@ -492,7 +499,7 @@ def import_(
         if one.error is not None:
             complain(str(one.error))
         for what, often in sorted(one.lost.items()):
-            say(f"{one.path.name}: {what}: {often} times, cannot be kept")
+            say(f"{one.path.name}: {what}: {number_of(often, 'time')}, cannot be kept")
     columns = ("file", "status", "trace", "frames", "entities", "edges")
     rows = ((str(o.path), o.status, o.name, o.frames, o.entities, o.edges) for o in done)
     out.write(columns, rows)

@@ -19,6 +19,7 @@ from sgstore.apps.cli._options import (
     tables_of,
 )
 from sgstore.apps.cli._output import ingest_bar, progress, say
+from sgstore.base.display import number_of
 from sgstore.errors import MissingExtraError
 
 PANEL: Final = "Pictures and exports"
@@ -143,7 +144,7 @@ def report(
     options: dict[str, Any] = {"around": around, "pictures": pictures, "parameters": values}
     many, more = bounds.opened(store).report(text, to=to, limit=limit, **options)
     if more:
-        say(f"the page has only the first {many} matches; raise --limit")
+        say(f"the page has only the first {number_of(many, 'match', 'es')}; raise --limit")
     typer.echo(to)
     return 0
 

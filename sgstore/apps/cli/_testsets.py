@@ -38,6 +38,7 @@ from sgstore.apps.cli._options import (
     say_scope,
 )
 from sgstore.apps.cli._output import count_bar, say
+from sgstore.base.display import number_of
 
 if TYPE_CHECKING:
     from sgstore.testsets.coverage import ChosenFrames
@@ -213,9 +214,10 @@ def verify_(
     wrong = [one for one in found if strict or one.matters]
     unread = sum(case.payload is None for case in known.cases)
     if unread or not payloads:
-        say(f"payloads of {unread if payloads else len(known.cases)} cases were not checked")
-    said = f"{len(wrong)} differences" if wrong else "as locked"
-    say(f"{path}: {len(known.cases)} cases of {len(known.traces)} traces: {said}")
+        unchecked = number_of(unread if payloads else len(known.cases), "case")
+        say(f"not checked: payloads of {unchecked}")
+    said = number_of(len(wrong), "difference") if wrong else "as locked"
+    say(f"{path}: {_cases(known)}: {said}")
     return ERROR if wrong else 0
 
 
@@ -253,10 +255,14 @@ def minus_(a: LockA, b: LockB, to: LockOut) -> None:
     say_made(minus(read_lock(a), read_lock(b)), to)
 
 
+def _cases(known: Lock) -> str:
+    return f"{number_of(len(known.cases), 'case')} of {number_of(len(known.traces), 'trace')}"
+
+
 def say_made(made: Lock, output: Path) -> None:
     """Write a lock (list of test cases with checksums) to a file, and print its content."""
     made.write(output)
-    say(f"{output}: {len(made.cases)} cases of {len(made.traces)} traces")
+    say(f"{output}: {_cases(made)}")
 
 
 @verbs.command(rich_help_panel=PANEL)

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from sgstore.base.display import first_of
+from sgstore.base.display import first_of, number_of
 from sgstore.base.tables import components
 from sgstore.maps.roads import RoadMap
 from sgstore.model.vocabulary import (
@@ -504,7 +504,7 @@ class AtOnce:
         what = f"{'lanes' if len(lanes) > 1 else 'lane'} {_listed(lanes)}"
         frames = max(self.frames[lane] for lane in lanes)
         lights = f"red by traffic light '{one}' and green by '{other}'"
-        return f"{what}: {lights} at once, in {frames} frames"
+        return f"{what}: {lights} at once, in {number_of(frames, 'frame')}"
 
 
 def _listed(names: list[Any]) -> str:

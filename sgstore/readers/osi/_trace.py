@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
 
+from sgstore.base.display import number_of
 from sgstore.mcap import Loss
 from sgstore.model.vocabulary import KINDS, TypeMeaning, type_meanings
 from sgstore.model.world import POSE, Event
@@ -105,7 +106,7 @@ class Environment:
     def settle(self) -> None:
         """Add a warning to the report if weather and light could not be read."""
         if self._unread:
-            words = f"weather and light cannot be read where they changed {self._unread} times"
+            words = f"weather and light cannot be read where they changed {number_of(self._unread, 'time')}"
             self._roster.report.warnings.append(words)
 
 
@@ -275,13 +276,15 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
             )
         if self._lights.unreadable:
             warn(
-                f"traffic lights cannot be read where they changed {self._lights.unreadable} times"
+                f"traffic lights cannot be read where they changed {number_of(self._lights.unreadable, 'time')}"
             )
         super().settle()
         never = {ident: count for ident, count in self._aside.items() if ident not in self._nodes}
         for ident, count in list(never.items())[: LossTally.MOST]:
             reason = f"moving object {ident} appears only between the frames of the leading channel"
-            self._report.losses.append(Loss(f"{reason}: {count} states were left out", 0, 0))
+            self._report.losses.append(
+                Loss(f"{reason}: {number_of(count, 'state')} left out", 0, 0)
+            )
         if self._ego is None:
             self._warn_of_egos(NO_EGO)
 
