@@ -6,12 +6,12 @@ Reading a table also verifies DuckDB's block checksums.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from sgstore.base.display import excerpt
+from sgstore.base.display import excerpt, number_of
 from sgstore.errors import SgstoreError, StoreError
 from sgstore.model.config import from_dict
 from sgstore.model.frame_ids import BUCKET_BITS
@@ -53,6 +53,13 @@ class Fault:
     trace: str
     check: str
     detail: str
+
+    @property
+    def remedy(self) -> str:
+        """Command that repairs the store. A changed recording needs its old file, or a new ingest."""
+        if self.check == "payloads":
+            return "put the old recording back, or run 'sgstore ingest --force'"
+        return "run 'sgstore rebuild'"
 
 
 @dataclass(slots=True)
@@ -168,7 +175,15 @@ def verify(
     ]
     read = partial(checksums, connection, _database(connection), count=count)
     for table in _trace_tables(connection, published):
-        faults += attempt(partial(_trace_faults, read, table, traces, published))
+        found = attempt(partial(_trace_faults, read, table, traces, published))
+        if [fault.trace for fault in found] == [""]:  # unreadable: find out which traces
+            read_one = partial(read, table, "trace", count=None)
+            each = (
+                (trace.name, attempt(partial(_read_faults, read_one, trace_id)))
+                for trace_id, trace in traces.items()
+            )
+            found = [replace(one, trace=name) for name, its in each for one in its] or found
+        faults += found
     places = {trace.name: place for place, trace in enumerate(traces.values())}
     result.faults += sorted(faults, key=lambda fault: places.get(fault.trace, -1))
     for owner in SHARED:
@@ -280,10 +295,16 @@ def _trace_faults(
             yield Fault(trace.name, "rows", _difference(table, now, then))
 
 
+def _read_faults(read: Callable[..., object], trace_id: int) -> tuple[()]:
+    """Read the rows of one trace in a table. They have no faults if the database can read them."""
+    read(only=trace_id)
+    return ()
+
+
 def _difference(table: str, now: Checksum, then: Checksum | None) -> str:
     rows = then.rows if then else 0
     if now.rows != rows:
-        return f"table {table} has {now.rows} rows of it; {rows} were published"
+        return f"table {table} has {number_of(now.rows, 'row')} of it; published: {rows}"
     return f"table {table} holds other values than were published"
 
 
@@ -318,7 +339,7 @@ def _rule_faults(
     grouped = f"SELECT trace_id, count(*) FROM ({sql}) AS found(trace_id) GROUP BY ALL ORDER BY ALL"
     for trace_id, count in connection.execute(grouped).fetchall():
         name = "" if trace_id is None else names.get(trace_id, str(trace_id))
-        yield Fault(name, check, f"{detail} ({count} times)")
+        yield Fault(name, check, f"{detail} ({number_of(count, 'time')})")
 
 
 def _database(connection: DuckDBPyConnection) -> str:

@@ -282,6 +282,8 @@ def test_a_store_is_verified_and_traces_are_removed(tmp_path) -> None:
     assert "2 traces" in well.stderr.decode()
     assert "2 recordings: no fault" in well.stderr.decode()
     assert (gone.returncode, [f["check"] for f in json.loads(gone.stdout)]) == (1, ["payloads"])
+    assert "ingest --force" in json.loads(gone.stdout)[0]["remedy"]
+    assert "2 recordings: 1 fault; remedy: put " in gone.stderr.decode()
     assert [(row["trace"], row["frames"]) for row in removed] == [("b", 5)]
     assert (none.returncode, "no trace 'b'" in none.stderr.decode()) == (1, True)
     assert [trace.name for trace in StoreFile(store).traces()] == ["a"]

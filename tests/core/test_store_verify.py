@@ -224,17 +224,21 @@ def test_a_file_that_is_damaged_is_told(tmp_path: Path) -> None:
     publish(store, RandomTrace(1, frames=600, path="one", moving=20))
     content = bytearray(store.path.read_bytes())
     rng = np.random.default_rng(0)
-    told = 0
+    told, named = 0, set[str]()
     for at in rng.integers(len(content) // 4, len(content), 12).tolist():
         hurt = bytearray(content)
         hurt[at] ^= 0x55
         (tmp_path / "hurt.db").write_bytes(hurt)
         try:
-            told += bool(StoreFile(tmp_path / "hurt.db").verify().faults)
+            faults = StoreFile(tmp_path / "hurt.db").verify().faults
+            told += bool(faults)
+            named |= {fault.trace for fault in faults if "Corrupt" in fault.detail}
+            assert {fault.remedy for fault in faults} <= {"run 'sgstore rebuild'"}
         except StoreError:
             told += 1
     # Some bytes of a file belong to nothing.
     assert told >= 6
+    assert "one" in named, named
 
 
 def test_recordings_are_hashed_again_where_that_is_asked_for(tmp_path: Path) -> None:

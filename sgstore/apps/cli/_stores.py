@@ -24,7 +24,7 @@ from sgstore.apps.cli._options import (
     jobs_of,
 )
 from sgstore.apps.cli._output import Format, count_bar, say, write_rows
-from sgstore.base.display import excerpts
+from sgstore.base.display import excerpts, number_of
 from sgstore.base.output_files import write_bytes
 from sgstore.errors import ExportError, StoreError
 
@@ -56,13 +56,16 @@ def verify(
 
     with count_bar("verifying", "rows") as progress:
         found = verify_file(store, recordings=payloads, progress=progress)
-    rows = [(fault.trace, fault.check, fault.detail) for fault in found.faults]
-    out.write(("trace", "check", "detail"), rows)
-    hashed = f", {found.recordings} recordings" if payloads else ""
-    wrong = f"{len(rows)} faults" if rows else "no fault"
+    columns = ("trace", "check", "detail", *([] if out.for_people else ["remedy"]))
+    rows = [tuple(getattr(fault, name) for name in columns) for fault in found.faults]
+    out.write(columns, rows)
+    hashed = f", {number_of(found.recordings, 'recording')}" if payloads else ""
+    wrong = number_of(len(rows), "fault") if rows else "no fault"
     if found.others:
         say(f"{store}: tables of other programs, not checked: {excerpts(found.others)}")
-    say(f"{store}: {found.traces} traces, {found.rows} rows{hashed}: {wrong}")
+    held = f"{number_of(found.traces, 'trace')}, {number_of(found.rows, 'row')}"
+    remedies = sorted({fault.remedy for fault in found.faults})
+    say(f"{store}: {held}{hashed}: {wrong}{'; remedy: ' if rows else ''}{', '.join(remedies)}")
     return ERROR if rows else 0
 
 
@@ -296,7 +299,7 @@ def payload(
         sys.stdout.buffer.write(data)
     else:
         write_bytes(to, data)
-    say(f"{to or 'stdout'}: {len(data)} bytes ({what})")
+    say(f"{to or 'stdout'}: {number_of(len(data), 'byte')} ({what})")
     return 0
 
 
