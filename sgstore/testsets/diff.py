@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
-from sgstore.base.display import first_of
+from sgstore.base.display import first_of, number_of
 from sgstore.model.frame_ids import seq_of, trace_of
 from sgstore.model.vocabulary import natural
 from sgstore.query import Store
@@ -43,10 +43,17 @@ def sources(a: Store | Collection, b: Store | Collection) -> list[str]:
     """
     was, now = map(_values_of, (a, b))
     return [
-        f"{name} differs: {_listed(was[name])} in A, {_listed(now[name])} in B"
+        f"{name} differs: {_only(was[name], now[name])}"
         for name in sorted(was.keys() & now.keys())
         if was[name] != now[name]
     ]
+
+
+def _only(was: set[str], now: set[str]) -> str:
+    """Return the values that only one of two stores has, as text."""
+    only = "only " if was & now else ""
+    parts = (("A", was - now), ("B", now - was))
+    return ", ".join(f"{_listed(values)} {only}in {where}" for where, values in parts if values)
 
 
 def _values_of(store: Store | Collection) -> dict[str, set[str]]:
@@ -106,9 +113,11 @@ def scenes(a: Classed, b: Classed) -> ReportTable:
     ]
     tally = Counter(row[0] for row in rows)
     said = [
-        f"{tally[APPEARED]} classes appeared, {tally[VANISHED]} vanished, {tally[CHANGED]} have another share;"
+        f"{number_of(tally[APPEARED], 'class', 'es')} appeared, {tally[VANISHED]} vanished,"
+        f" {tally[CHANGED]} have another share;"
         f" {int(((in_a > 0) & (in_b > 0)).sum())} are in both",
-        f"A: {a.chosen.text}, {int(in_a.sum())} frames; B: {b.chosen.text}, {int(in_b.sum())} frames",
+        f"A: {a.chosen.text}, {number_of(int(in_a.sum()), 'frame')};"
+        f" B: {b.chosen.text}, {number_of(int(in_b.sum()), 'frame')}",
         *of_unknown(a.unknown, a.chosen.text),
         *of_unknown(b.unknown, b.chosen.text),
     ]

@@ -510,3 +510,11 @@ def test_differences_of_settings_come_first(tmp_path: Path) -> None:
 
     assert sources(before, before) == []
     assert sources(before, after) == ["setting range.radius differs: 50.0 in A, 30.0 in B"]
+
+
+def test_diff_lists_only_the_maps_that_differ(monkeypatch: pytest.MonkeyPatch) -> None:
+    maps = {"a": {"Town01", "Town02", "Town03", "Town04"}}
+    maps["b"] = maps["a"] | {"Town10"}
+    monkeypatch.setattr("sgstore.testsets.diff._values_of", lambda of: {"map": maps[of]})
+
+    assert sources("a", "b") == ["map differs: Town10 only in B"]  # type: ignore[arg-type]
