@@ -14,7 +14,7 @@ import typer
 from typer import Argument, Option
 
 from sgstore.apps.cli import _completion as completion
-from sgstore.apps.cli._collection_options import note_collection, url_of
+from sgstore.apps.cli._collection_options import note_collection, shown_bundle, url_of
 from sgstore.apps.cli._options import (
     ERROR,
     LOSS,
@@ -72,6 +72,9 @@ def ingest(
 ) -> int:
     """Read recordings into a store; recordings that it already contains are skipped.
 
+    Exit codes: 0 all were read; 1 a recording failed, the others are in the store; 2 wrong usage;
+    3 parts of a recording were lost.
+
     Parameters
     ----------
     ego
@@ -120,17 +123,21 @@ def ingest(
 
 def _report_outcomes(outcomes: list[TraceOutcome], out: PrintedRows) -> int:
     """Print the result of an ingest for each recording, and return the exit code."""
-    from sgstore.model.scope import scope_of
-
+    first = {outcome.path: outcome for outcome in reversed(outcomes)}
     for outcome in outcomes:
         _say_warnings(outcome)
+        if outcome is first[outcome.path] and (taken := _taken_name(outcome)):
+            say(
+                f"{place_named(outcome.path)}: stored as {outcome.name!r}, because the store has"
+                f" another trace {taken!r}"
+            )
     code = ERROR if any(outcome.error for outcome in outcomes) else 0
     if out.for_people:  # an error is no row
         outcomes = [outcome for outcome in outcomes if not outcome.error]
     reports: list[dict[str, Any]] = [
         {"scope": outcome.scope} if outcome.scope else {} for outcome in outcomes
     ]
-    say_scope(scope_of(reports, world=None), out.chosen)
+    _say_scope(reports, out)
     columns = ("trace", "status", "ego", "frames", "entities", "seconds", "losses", "file")
     rows = map(_outcome_row, outcomes)
     totals = {"frames": "frames", "losses": "losses"}
@@ -141,6 +148,21 @@ def _report_outcomes(outcomes: list[TraceOutcome], out: PrintedRows) -> int:
     more = ("scope", "warnings", "error", "losses_at")
     out.write(*_with_more(columns, rows, reports, more, out), totals=totals)
     return code or (LOSS if any(outcome.losses for outcome in outcomes) else 0)
+
+
+def _taken_name(outcome: TraceOutcome) -> str:
+    """Return the name of a file that another trace of the store has; empty if the trace has its name."""
+    name, _, number = outcome.name.rpartition("~")
+    renamed = outcome.status == "added" and outcome.name != outcome.path.stem
+    return name if renamed and number.isdecimal() else ""
+
+
+def _say_scope(reports: Iterable[Mapping[str, Any]], out: PrintedRows) -> None:
+    """Print the data that the settings of traces excluded. Rows of machine formats have it as ``scope``."""
+    from sgstore.model.scope import scope_of
+
+    if out.chosen not in {Format.json, Format.ndjson}:
+        say_scope(scope_of(reports, world=None), out.chosen)
 
 
 def _with_more(
@@ -229,8 +251,6 @@ def info(
     traces
         Show details of a trace, by name, id, or start of one; repeatable.
     """
-    from sgstore.model.scope import scope_of
-
     if (url := url_of(store)) is not None:
         _list_collection(url, traces or [], out)
         return 0
@@ -243,7 +263,7 @@ def info(
     columns = ("trace", "frames", "seconds", "ego", "map", "flavour", "losses", "trace_id", "file")
     stored = file.traces()
     reports = [one.report for one in stored]
-    say_scope(scope_of(reports, world=None), out.chosen)
+    _say_scope(reports, out)
     for one in stored:
         counts = {"clock jump": "clock_jumps", "gap": "gaps"}
         steps = [
@@ -286,11 +306,16 @@ def _list_collection(url: str, names: list[str], out: PrintedRows) -> None:
         if name not in known:
             raise StoreError(f"{url}: no trace {name!r}")
     columns = ("trace", "frames", "seconds", "ego", "map", "trace_id", "bundle", "file")
-    digits = 12 if out.for_people else None
     rows = (
         (
             *(row["name"], row["frames"], round(covered_s(*(row[name] for name in _TIMES)), 3)),
-            *(row["ego"], row["map"], row["trace_id"], row["bundle"][:digits], row["uri"]),
+            *(
+                row["ego"],
+                row["map"],
+                row["trace_id"],
+                shown_bundle(row["bundle"], out),
+                row["uri"],
+            ),
         )
         for row in found
         if not names or row["name"] in names
