@@ -97,7 +97,13 @@ def write(export: Export, folder: Path) -> list[WrittenFile]:
     (folder / "README.md").write_bytes(_card(export, counts).encode())
     columns = sum(map(len, fields.values()))
     written.append(WrittenFile.of(folder / "fields.json", "columns", columns))
-    return [*written, WrittenFile.of(folder / "README.md", "card", 1)]
+    return [*written, WrittenFile.of(folder / "README.md", "card", 1, notes=[_NOT_EXPORTED])]
+
+
+_NOT_EXPORTED: Final = (
+    "views such as pairs, lane_states, events and world_nodes are not exported;"
+    " sgstore sql STORE 'FROM pairs' -o pairs.parquet writes one, --as duckdb all"
+)
 
 
 class _Present:

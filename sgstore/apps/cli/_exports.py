@@ -68,13 +68,13 @@ def export(
     out: PrintedRows,
     bounds: QueryLimits,
 ) -> int:
-    """Cut matches out of their recordings, as clips with the original messages.
+    """Export matches: clips of their recordings (mcap, the default), tables, pictures or graphs.
 
-    Other formats: tables (parquet, lance), a database of them (duckdb), pictures and clouds
-    (frames), scenarios to drive again (xosc), labels (openlabel), recordings for Rerun (rrd), maps
-    (geojson), graphs for networkx (nx), PyTorch Geometric (pyg) and S3C (s3c). Without a query all
-    frames are exported, but no recordings (mcap, frames). RETURN CLIPS(-3s, +5s) in the query
-    wins over --before and --after.
+    Clips have the original messages. Other formats: tables (parquet, lance), a database of them
+    (duckdb), pictures and clouds (frames), scenarios to drive again (xosc), labels (openlabel),
+    recordings for Rerun (rrd), maps (geojson), graphs for networkx (nx), PyTorch Geometric (pyg)
+    and S3C (s3c). Without a query all frames are exported, but no recordings (mcap, frames).
+    RETURN CLIPS(-3s, +5s) in the query wins over --before and --after.
 
     Parameters
     ----------
