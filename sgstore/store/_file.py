@@ -309,6 +309,13 @@ class StoreFile:
 
         return UserSql(RecordingSql(path).answered, sql, timeout_s, None)
 
+    @staticmethod
+    def recorded_topics(path: Path) -> list[str]:
+        """Return the names of the topics of a recording, sorted."""
+        from sgstore.store._topic_views import topics_in
+
+        return sorted(topics_in(path))
+
     def joined(self) -> dict[str, JoinedTable]:
         """Return the row counts of user tables that are joined with frames, by table name."""
         with self.access.reading() as connection:

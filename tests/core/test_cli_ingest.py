@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import shutil
 import subprocess
 import sys
 from contextlib import redirect_stderr, redirect_stdout
@@ -16,6 +17,7 @@ from recordings import Recorder, car, drive
 
 from sgstore.apps.cli import run
 from sgstore.ingest import ingest
+from sgstore.model.vocabulary import OWN_KINDS
 from sgstore.store import StoreFile
 
 
@@ -262,6 +264,78 @@ def test_doctor_is_well_with_what_is_well_and_fails_with_what_is_no_recording(tm
     assert other.returncode == 1
     assert "cannot be read" in other.stdout.decode()
     assert "pictures.Image" in other.stdout.decode()
+
+
+def test_an_ingest_reports_a_trace_that_cannot_have_the_name_of_its_file(tmp_path) -> None:
+    (tmp_path / "later").mkdir()
+    store, first = tmp_path / "s.db", drive(tmp_path / "same.mcap", frames=3)
+    later = drive(tmp_path / "later" / "same.mcap", frames=4)
+
+    said = [sgstore("ingest", store, one).stderr.decode() for one in (first, later, later)]
+
+    line = f"{later}: stored as 'same~2', because the store has another trace 'same'"
+    assert [line in one for one in said] == [False, True, False]
+
+
+# sql
+
+
+def test_sql_with_two_stores_leads_to_a_collection(store, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    other = shutil.copy(store, tmp_path / "other.db")
+    run = sgstore("sql", store, other, "SELECT count(*) AS n FROM frames")
+    said = " ".join(run.stderr.decode().replace("│", " ").split())
+
+    assert run.returncode == 2
+    assert "expected one store, found 2; make a collection of them" in said
+    for one in (store, other):
+        assert sgstore("collection", "pack", one, "fleet").returncode == 0
+    rows = in_json("sql", "fleet", "--each", "SELECT count(*) AS n FROM frames")
+    (bundle,) = {row["bundle"] for row in in_json("info", "fleet")}
+    assert [row["bundle"] for row in rows] == [bundle]
+    tables = [
+        sgstore("sql", "fleet", "--each", "SELECT 1").stdout.decode(),
+        sgstore("info", "fleet").stdout.decode(),
+    ]
+    assert all(f" {bundle[:12]} " in f" {table.replace(chr(10), ' ')} " for table in tables)
+
+
+def test_sql_lists_the_topics_of_a_recording(tmp_path) -> None:
+    path = drive(tmp_path / "drive.mcap", frames=3)
+    run = sgstore("sql", path, "SHOW TABLES")
+
+    assert (run.returncode, run.stdout) == (0, b"")
+    assert "the tables of a recording are its topics: topic('camera')," in run.stderr.decode()
+
+
+def test_sql_shortens_enumerations_in_tables_only(store) -> None:
+    table = sgstore("sql", store, "DESCRIBE entities").stdout.decode()
+    (kind,) = [r for r in in_json("sql", store, "DESCRIBE entities") if r["column_name"] == "kind"]
+
+    assert max(map(len, table.splitlines())) < 100
+    assert f"ENUM('car', 'truck', 'van', … {len(OWN_KINDS)} values)" in table
+    assert "'roundabout'" in kind["column_type"]
+
+
+def test_help_names_the_tables_of_exports_and_the_codes_of_ingest() -> None:
+    texts = {verb: " ".join(sgstore(verb, "-h").stdout.decode().split()) for verb in VERBS}
+
+    assert (
+        "Export matches: clips of their recordings (mcap, the default), tables" in texts["export"]
+    )
+    assert "3 parts of a recording were lost" in texts["ingest"]
+    assert "'SHOW TABLES' lists the views" in texts["sql"]
+
+
+VERBS = ("export", "ingest", "sql")
+
+
+def test_an_export_of_tables_names_the_views_without_one(store, tmp_path) -> None:
+    run = sgstore("export", store, "--as", "parquet", "--to", tmp_path / "tables")
+
+    assert "views such as pairs, lane_states, events and world_nodes are not exported" in (
+        run.stderr.decode()
+    )
 
 
 # verify, remove

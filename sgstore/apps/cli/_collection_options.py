@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 from typer import Option
 
-from sgstore.apps.cli._options import COLLECTION_FILE, LOSS, QueryLimits, tables_of
+from sgstore.apps.cli._options import COLLECTION_FILE, LOSS, PrintedRows, QueryLimits, tables_of
 from sgstore.apps.cli._output import say
 from sgstore.errors import url_named
 
@@ -72,6 +72,11 @@ class CollectionOptions:
             return bounds.opened(place)
         with self.collection_at(url, bounds) as whole:
             return whole
+
+
+def shown_bundle(bundle: str, out: PrintedRows) -> str:
+    """Return the name of a bundle as shown in tables (12 digits), or in full for programs."""
+    return bundle[:12] if out.for_people else bundle
 
 
 _collections: Final[list[Any]] = []  # Collection

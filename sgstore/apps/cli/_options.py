@@ -281,11 +281,22 @@ def _advise(error: Any, verb: Verb, ctx: Any, args: list[str]) -> None:
     if type(error).__name__ == "NoSuchOption" and (line := _option_instead(verb, ctx, args, name)):
         error.possibilities = None
         error.message = f"No such option: {name}; write: {line}"
+    stores = [one for one in args if _is_database(one)] if _places(verb) else []
+    if len(stores) > 1 and "extra argument" in str(getattr(error, "message", "")):
+        error.message = _several_stores(ctx, stores)
     if type(error).__name__ == "MissingParameter":
         if error.param.name in _places(verb)[1:]:
             error.message = "Write the store first."
         elif "\n" in (text := error.format_message()):  # a line for each choice
             raise typer.BadParameter(" ".join(text.split()), ctx=ctx) from None
+
+
+def _several_stores(ctx: Any, stores: Sequence[str]) -> str:
+    """Return the message for several stores in a command line that takes one: make a collection of them."""
+    lines = [shlex.join(["sgstore", "collection", "pack", one, "fleet"]) for one in stores]
+    each = " --each" if _path_of(ctx) == "sql" else ""
+    lines.append(f"{ctx.command_path} fleet{each} …")
+    return f"expected one store, found {len(stores)}; make a collection of them: {'; '.join(lines)}"
 
 
 def _places(verb: Verb) -> list[str]:

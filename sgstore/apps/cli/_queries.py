@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from enum import StrEnum
 from itertools import chain, islice
 from pathlib import Path
@@ -11,7 +12,12 @@ import typer
 from typer import Argument, Option
 
 from sgstore.apps.cli import _completion as completion
-from sgstore.apps.cli._collection_options import COLLECTIONS, CollectionOptions, url_of
+from sgstore.apps.cli._collection_options import (
+    COLLECTIONS,
+    CollectionOptions,
+    shown_bundle,
+    url_of,
+)
 from sgstore.apps.cli._options import (
     NO_MATCH,
     Abstraction,
@@ -48,7 +54,7 @@ from sgstore.apps.cli._output import (
     write_document,
     write_text,
 )
-from sgstore.base.display import number_of
+from sgstore.base.display import excerpts, number_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -380,7 +386,8 @@ def sql(
 ) -> int:
     """Run a read-only SQL statement on a store, or on the topics of a recording.
 
-    Views: frames, nodes, edges, lane_states, lane_gaps, pairs, lanes, entities, payloads; DESCRIBE them.
+    'SHOW TABLES' lists the views, such as frames, nodes, edges, pairs and world_pairs; 'DESCRIBE nodes'
+    their columns; 'sgstore docs views' explains them.
     What a pattern returns is a table, too: FROM sgql('MATCH … RETURN …'); and messages: FROM topic('/imu').
 
     Parameters
@@ -393,7 +400,8 @@ def sql(
     if (url := url_of(store)) is not None:
         with whole.collection_at(url, ask, tables, safe=safe) as opened:
             rows = opened.sql(query_of(statement, file), each=each)
-            ask.write(rows.columns, islice(rows, limit or None))
+            shown = ((shown_bundle(row[0], ask), *row[1:]) for row in rows)
+            ask.write(rows.columns, islice(shown, limit or None))
             say_left_out(rows)
             return 0
     if safe:
@@ -406,7 +414,11 @@ def sql(
         from sgstore.store import StoreFile
 
         seconds = seconds_of(ask.timeout, "--timeout") if ask.timeout else None
-        _write_sql(StoreFile.recording_sql(store, query_of(statement, file), seconds), limit, ask)
+        text = query_of(statement, file)
+        number = _write_sql(StoreFile.recording_sql(store, text, seconds), limit, ask)
+        if not number and text.split()[0].upper() == "SHOW":
+            topics = excerpts([f"topic('{name}')" for name in StoreFile.recorded_topics(store)])
+            say(f"the tables of a recording are its topics: {topics or 'none'}")
         return 0
     from sgstore.query import UserStatement
 
@@ -424,14 +436,27 @@ def _is_recording(path: Path) -> bool:
     return path.exists() and is_recording(path)
 
 
-def _write_sql(sql: Any, limit: int, ask: AskOptions) -> None:
-    """Write the rows of an SQL statement in the chosen format."""
+def _write_sql(sql: Any, limit: int, ask: AskOptions) -> int:
+    """Write the rows of an SQL statement in the chosen format, and return their number."""
     if (form := ask.chosen) in BINARY and not limit:
-        write_binary(sql.parquet, form, ask.to)
-        return
+        return write_binary(sql.parquet, form, ask.to)
     with sql.batches() as batches:
         rows = chain.from_iterable(batch.values for batch in batches)
-        ask.write(batches.columns, islice(rows, limit or None), batches.types)
+        if ask.for_people and batches.columns[:2] == ("column_name", "column_type"):
+            rows = ((name, _short_type(kind), *more) for name, kind, *more in rows)
+        return ask.write(batches.columns, islice(rows, limit or None), batches.types)
+
+
+def _short_type(kind: str) -> str:
+    """Return a column type without the values of an enumeration, except the first ones."""
+    values = re.findall(r"'(?:[^']|'')*'", kind) if kind.startswith("ENUM(") else []
+    if len(values) <= _VALUES_SHOWN:
+        return kind
+    return f"ENUM({', '.join(values[:_VALUES_SHOWN])}, … {len(values)} values)"
+
+
+_VALUES_SHOWN: Final = 3
+"""Largest number of values of an enumeration in a text table. Other formats have all values."""
 
 
 def _sandbox(store: Path, bounds: QueryLimits, limit: int, tables: list[str] | None) -> Sandbox:
