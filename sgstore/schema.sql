@@ -395,7 +395,7 @@ COMMENT ON VIEW main.lane_gaps IS 'How far it is along the lanes: one row for ea
 -- writes the SELECT of this view, with a column for each of them, and what its comment says of them.
 CREATE VIEW main.pairs AS {{pairs}};
 
-COMMENT ON VIEW main.pairs IS 'One row for each ordered pair of entities that move or change (traffic lights change), in the same frame, however far apart; a is src, b is dst. Without lights: WHERE src_kind <> ''traffic_light'' AND dst_kind <> ''traffic_light''. {{numbers of pairs}}. For how far it is along the lanes LEFT JOIN lane_dists USING (frame_id, src, dst).';
+COMMENT ON VIEW main.pairs IS 'One row for each ordered pair of entities of a graph (within [range] radius of the ego; world_pairs has the others) that move or change (traffic lights change), in the same frame; a is src, b is dst. Without lights: WHERE src_kind <> ''traffic_light'' AND dst_kind <> ''traffic_light''. {{numbers of pairs}}. For how far it is along the lanes LEFT JOIN lane_dists USING (frame_id, src, dst).';
 
 -- As many columns again, whose statement takes the database some time to read.
 CREATE VIEW main.criticality AS {{criticality}};
@@ -474,6 +474,15 @@ SELECT e.trace_id, e.node_id, e.kind, e.kind || ' ' || e.node_id AS name, e.iden
 FROM inside.entity e JOIN inside.trace t ON t.trace_id = e.trace_id;
 
 COMMENT ON VIEW main.entities IS 'One row an entity of a trace. ident, type_name: as the simulator has them; is_static: it never moves, and its pose is here; map_ref: the OpenDRIVE signal or object that it is, of a signal that the map does not have the names of the lanes that it applies to; parked: whether a vehicle does not move in the whole trace and is never on a lane for driving, or is static in the simulator; lifetime: 1, 2, …: which of the entities with this ident: an id that returns as another kind, or where it cannot have moved, is a new entity; trace: name of the recording.';
+
+CREATE VIEW main.traces AS
+SELECT t.name AS trace, t.trace_id, r.uri AS file, t.flavour, t.ego, m.name AS map, t.frames,
+       round((CASE WHEN t.end_ns >= t.start_ns THEN t.end_ns - t.start_ns ELSE (t.frames - 1) * abs(t.period_ns) END) / 1e6) / 1e3 AS seconds,
+       t.start_ns, t.end_ns, t.since, t.until, coalesce(json_array_length(t.report, '$.losses'), 0) AS losses,
+       json_extract(t.report, '$.scope') AS scope, r.digest AS sha256, t.ingested_at, t.version
+FROM inside.trace t JOIN inside.recording r ON r.recording_id = t.recording_id LEFT JOIN inside.map m ON m.map_id = t.map_id;
+
+COMMENT ON VIEW main.traces IS 'One row a trace: a recording with one ego. trace: its name in this store; trace_id: equal in every store; file: path of the recording when it was ingested; flavour: the reader, such as osi; ego: as the simulator calls it, NULL without one; map: name of the road map, NULL without one; seconds: duration; start_ns, end_ns: simulation time of the first and the last frame; since, until: the part of the recording that was read, in seconds, NULL for its start and end; losses: number of unreadable parts; scope: states that the settings exclude, as JSON; sha256: of the recording; ingested_at: in UTC; version: of sgstore.';
 
 CREATE VIEW main.payloads AS
 SELECT f.frame_id, c.topic AS channel, p.log_time_ns, (p.log_time_ns - f.log_time_ns) / 1e9 AS offset_s, c.schema, r.uri AS file,

@@ -129,6 +129,7 @@ def views_of(store: Store) -> dict[str, list[str]]:
     sql = (
         "SELECT table_name, column_name FROM information_schema.columns WHERE table_name IN"
         " (SELECT view_name FROM duckdb_views() WHERE NOT internal AND schema_name = 'main')"
+        " AND table_name <> 'traces'"  # info has its values
         " ORDER BY table_name, ordinal_position"
     )
     found: dict[str, list[str]] = {}

@@ -52,8 +52,8 @@ def schema_version() -> str:
 
 
 TEXT: Final = (
-    "00db79f99f65db85dcf5777ebf3fba83757e36344e40df1960edfdd0d557e682",
-    "f21db8c06fd034705d8c91c7bbbda2d746286065caf4d4a8ef58f757bdb5e0a8",
+    "1e5477db7ac5dd58262c8260117368defd984d0a4e548de85ce507805d8dbb66",
+    "e5268bcc3af76249caab4d312a26142d856e9876e70aae802ef79cee53957638",
 )
 """Known digests: of the text of ``schema.sql``, and of its statements, whose parsing takes 10 ms."""
 
@@ -121,13 +121,17 @@ BEFORE_TRACE: Final = {
         "edges",
         "world_nodes",
         "entities",
+        "traces",
     ),
-    "b97bda47e1fdf0a4a970985fd707ae4ee0fa509ef4d7056cbef17b61ee7f0bb5": ("entities",),
+    "b97bda47e1fdf0a4a970985fd707ae4ee0fa509ef4d7056cbef17b61ee7f0bb5": ("entities", "traces"),
 }
-"""Digest of an older schema → its views without the column ``trace``.
+"""Digest of an older schema → its views without the column ``trace``, and the views that it lacks.
 
-Such stores are read. The next write adds the column: see :func:`add_trace`.
+Such stores are read. The next write adds them: see :func:`add_trace`.
 """
+
+NEW_VIEWS: Final = frozenset({"traces"})
+"""Views that older stores lack."""
 
 _TRACE: Final = re.compile(
     r" , (t \. name AS trace|n \. trace|t \. name(?= FROM))"
@@ -137,7 +141,9 @@ _TRACE: Final = re.compile(
 
 
 def add_trace(connection: DuckDBPyConnection, database: str = "") -> None:
-    """Add the column ``trace`` to the views of an older store.
+    """Add the column ``trace`` to the views of an older store, and the views that it lacks.
+
+    A store in which a user's table has the name of a new view is not changed.
 
     Parameters
     ----------
@@ -149,13 +155,19 @@ def add_trace(connection: DuckDBPyConnection, database: str = "") -> None:
     info = f"{quoted(database)}.{INSIDE}.store_info" if database else f"{INSIDE}.store_info"
     digests = connection.execute(f"SELECT value FROM {info} {where}").fetchall()
     names = [name for (digest,) in digests for name in BEFORE_TRACE.get(digest, ())]
-    if not database:
-        for name in names:
-            view = expected().views[name].replace(" main . nodes ", " nodes ")
-            connection.execute(f"CREATE OR REPLACE TEMP VIEW {name} AS {view}")
-    if not names or not database:
+    if not names:
         return
     ((before,),) = connection.execute("SELECT current_database()").fetchall()
+    objects = objects_of(connection, database or before)
+    taken = {name.lower() for _, schema, name, _ in objects if schema == "main"} & NEW_VIEWS
+    if not database:
+        for name in names:
+            if name in taken:
+                continue
+            view = expected().views[name].replace(" main . nodes ", " nodes ")
+            connection.execute(f"CREATE OR REPLACE TEMP VIEW {name} AS {view}")
+    if not database or taken:
+        return
     connection.execute(f"USE {quoted(database)}; BEGIN TRANSACTION")
     for name in names:
         connection.execute(f"CREATE OR REPLACE VIEW main.{name} AS {expected().views[name]}")
@@ -378,7 +390,13 @@ def _altered(connection: DuckDBPyConnection, database: str, objects: Objects) ->
 def _any_changed(connection: DuckDBPyConnection, objects: Objects) -> tuple[str, ...]:
     """Return the faults of a store, compared with the current or the older views."""
     views = _expected_views(connection)
-    older = (views | {name: views[f"{name}:"] for name in names} for names in BEFORE_TRACE.values())
+    older = (
+        {
+            name: views.get(f"{name}:" if name in names else name, "")
+            for name in views.keys() - (NEW_VIEWS & {*names})
+        }
+        for names in BEFORE_TRACE.values()
+    )
     return min((tuple(_changed(objects, one)) for one in (views, *older)), key=len)
 
 
@@ -387,7 +405,7 @@ _compared: dict[Objects, tuple[str, ...]] = {}
 
 _MOST_COMPARED: Final = 64
 
-KNOWN: Final = "b9efbf0ceb2b2eab557a6082c12c812cbaae821f3bb288559446d87768f59a1d"
+KNOWN: Final = "3fc8d1bd15f0fd9c83366a745207e856e85f93290c8292bf5cea6a644d3b2d2f"
 """Known digest of a valid store's objects in DuckDB 2. It avoids a comparison of tokens (30 ms).
 
 Objects of other versions are compared token by token.
@@ -395,8 +413,8 @@ Objects of other versions are compared token by token.
 
 
 KNOWN_BEFORE_TRACE: Final = (
-    "fc36e4bd80dd83197ca9c81f34c4fa035e74a4411cfc9337507c05875eceacf4",
-    "f09b4c628038839dbf097859aca1d2b25eeb0b5148de4058bd7d6a75b9be918b",
+    "67a1e889548b35aea29187ebe60625b8a9972a94cede672da4fa62ceec3afe26",
+    "58eb62162e09868669b8fcc0eae2bd07beae958f0a5ad03ac48de9891774ad8a",
 )
 """Known digests of valid older stores, in the order of :data:`BEFORE_TRACE`."""
 
@@ -424,7 +442,7 @@ def _changed(objects: Objects, views: dict[str, Tokens]) -> Iterator[str]:
     )
     yield from _differing("table", shape.tables, made["table", INSIDE], made["view", INSIDE])
     for schema, of in (("main", shape.views), (INSIDE, shape.inner)):
-        wanted = {name: views[name] for name in of}
+        wanted = {name: views[name] for name in of if name in views}
         yield from _differing("view", wanted, made["view", schema], made["table", schema])
     yield from _differing("type", shape.types, types, {})
     yield from _misplaced(objects, shape)
@@ -715,6 +733,10 @@ _VIEWS_BEYOND: Final[Mapping[str, Mapping[str, str]]] = {
     "lane_dists": {"lane_state": "known_lane_state"},
 }
 """Views of graphs → replacements of tables that turn them into views of the data outside the graphs."""
+
+
+WORLD_VIEWS: Final = frozenset(_VIEWS_BEYOND)
+"""Views of graphs for which a view ``world_…`` exists."""
 
 
 def _between(text: str, before: str, behind: str) -> str:

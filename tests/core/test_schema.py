@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -38,6 +39,7 @@ VIEWS = {
     "entities": "trace_id node_id kind name ident special subkind type_name is_static map_ref"
     " x y z heading length width height parked lifetime trace",
     "events": "frame_id trace_id trace kind time_ns t log_time_ns node_id other value detail ident other_ident",
+    "traces": "trace trace_id file flavour ego map frames seconds start_ns end_ns since until losses scope",
     "imports": "frame_id graph place images",
     "attributes": "frame_id node_id name text value",
     "edge_attributes": "frame_id src relation dst name text value",
@@ -152,6 +154,9 @@ def without_trace(path: Path, digest: str) -> None:
     """Make a store an older one, whose views have no column ``trace``."""
     with duckdb.connect(str(path)) as connection:
         for name in shape.BEFORE_TRACE[digest]:
+            if name in shape.NEW_VIEWS:
+                connection.execute(f"DROP VIEW main.{name}")
+                continue
             text = shape._TRACE.sub("", shape.expected().views[name])
             assert text != shape.expected().views[name]
             connection.execute(f"CREATE OR REPLACE VIEW main.{name} AS {text}")
@@ -192,6 +197,38 @@ def test_views_of_an_older_store_have_the_trace_and_a_write_adds_it(
         objects = shape.objects_of(connection, shape.database_of(connection))
         assert [*shape._changed(objects, shape._expected_views(connection))] == []
     assert list(sgstore.open(path).file.verify().faults) == []
+
+
+@pytest.mark.parametrize("digest", shape.BEFORE_TRACE)
+def test_a_table_of_a_user_keeps_the_name_of_a_new_view_in_an_older_store(
+    digest: str, tmp_path: Path, town_store: Path
+) -> None:
+    path = Path(shutil.copy(town_store, tmp_path / "old.sgstore"))
+    without_trace(path, digest)
+    with duckdb.connect(str(path)) as connection:
+        connection.execute("CREATE TABLE traces AS SELECT 'mine' AS x")
+
+    for _ in range(2):
+        store = sgstore.open(path)
+        assert store.sql("SELECT x FROM traces").values == [("mine",)]
+        assert list(store.file.verify().faults) == []
+        store.file.remove(*(one.name for one in store.traces()))
+        store.close()
+
+
+def test_traces_are_those_of_info(tmp_path: Path, town_store: Path) -> None:
+    store = sgstore.open(town_store)
+    (one,) = store.traces()
+    names = "trace, trace_id, file, flavour, ego, map, frames, start_ns, end_ns, losses, sha256, version"
+    (row,) = store.sql(f"SELECT {names} FROM traces").values
+    ((seconds, scope),) = store.sql("SELECT seconds, scope FROM traces").values
+
+    assert row == (
+        *(one.name, one.trace_id, str(one.path), one.flavour, one.ego, one.map, one.frames),
+        *(one.start_ns, one.end_ns, len(one.report["losses"]), one.digest, one.version),
+    )
+    assert seconds == pytest.approx(one.seconds, abs=1e-3)
+    assert json.loads(scope) == one.report["scope"]
 
 
 @pytest.mark.skipif(duckdb.__version__ < "2", reason="this version's words are compared")
