@@ -16,8 +16,9 @@ from sgstore.lang.library import require_sql, statement
 from sgstore.lang.sql import CONSTANTS, about_frame, compile_query, union_parts
 from sgstore.matches import UnionMatches
 from sgstore.model.criticality import KNOWN
+from sgstore.model.scope import scope_of
 from sgstore.model.vocabulary import normalize_name
-from sgstore.store import FrameRef, StoreFile, UserTables, measured
+from sgstore.store import FrameRef, StoreFile, UserTables, kind_notes, measured, world_read
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -1716,21 +1717,23 @@ class UserStatement:
     reasons : mapping of str to str
         Reasons why a pattern skips traces, by trace name.
     notes : tuple of str
-        Notes on likely mistakes in patterns.
+        Notes on likely mistakes in patterns and kinds.
     """
 
     def __init__(self, find: Callable[..., Matches], tables: Collection[str], text: str) -> None:
         require_sql(text)
         self._sql, self._given = text, None
+        self._patterns: list[Matches] = []
         self.reasons: dict[str, str] = {}
-        self.notes: tuple[str, ...] = ()
+        self.notes: tuple[str, ...] = kind_notes(text)
         if "sgql" not in text.lower():
             return
         from sgstore.lang.syntax import pattern_tables
 
         self._sql, calls = pattern_tables(text, tables)
         found = [(one.name, find(one.text, **dict(one.values))) for one in calls]
-        for _, matches in found:
+        self._patterns = [matches for _, matches in found]
+        for matches in self._patterns:
             self.reasons |= matches.reasons
             self.notes += matches.notes
         if found:
@@ -1739,6 +1742,13 @@ class UserStatement:
     def on(self, file: StoreFile, timeout_s: float | None = None) -> Any:
         """Prepare the statement for a store, with a table for each pattern; see :meth:`StoreFile.user_sql`."""
         return file.user_sql(self._sql, timeout_s, self._given)
+
+    def scope(self, file: StoreFile) -> dict[str, Any]:
+        """Data that settings exclude from the views and patterns of the statement, as JSON values."""
+        world = world_read(self._sql)
+        if world is None:
+            return next((one.scope for one in self._patterns), {})
+        return scope_of((one.report for one in file.traces()), world=world)
 
 
 def _png(image: Image) -> bytes:

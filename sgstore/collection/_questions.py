@@ -56,6 +56,8 @@ from sgstore.store import (
     Tabular,
     Triples,
     UserTables,
+    kind_notes,
+    world_read,
 )
 from sgstore.temporal import CheckRun, TemporalMatches
 
@@ -849,9 +851,9 @@ class CollectionRows(Tabular):
         self._whole, self._text = whole, text
         self._columns: tuple[str, ...] = ()
         self.reasons: dict[str, str] = {}
-        self.notes: tuple[str, ...] = ()
+        self.notes = kind_notes(text)
         if "topic" in text.lower():
-            self.notes = tuple(_null_fields(whole, text))
+            self.notes += tuple(_null_fields(whole, text))
         if "sgql" in text.lower():
             _, calls = pattern_tables(text, whole.catalog.tables)
             for one in calls:
@@ -876,6 +878,12 @@ class CollectionRows(Tabular):
                     yield result["bundle"], *json.loads(line)
         if missing and not self._columns:
             raise unknown_topic(missing, self._whole.catalog.topics)
+
+    @property
+    def scope(self) -> dict[str, Any]:
+        """Data that settings exclude from the views of the statement, as JSON values."""
+        world = world_read(self._text)
+        return {} if world is None else self._whole.snapshot.scope(world=world)
 
     @property
     def columns(self) -> tuple[str, ...]:

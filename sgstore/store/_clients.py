@@ -9,6 +9,7 @@ import duckdb as engine
 
 from sgstore.store._engine_errors import translated
 from sgstore.store._locking import without_faults
+from sgstore.store._sql_words import show_is_a
 from sgstore.store._store_paths import refuse_special
 
 if TYPE_CHECKING:
@@ -41,4 +42,5 @@ def duckdb(path: str | Path) -> DuckDBPyConnection:
     with translated(path):
         connection = engine.connect(str(path.absolute()), read_only=True)
     without_faults(connection)
+    show_is_a(connection)
     return connection

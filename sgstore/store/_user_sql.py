@@ -19,6 +19,7 @@ from sgstore.store._engine_errors import EngineError, engine_fault, spill_fault
 from sgstore.store._interrupts import interrupt
 from sgstore.store._rows import BATCH, Batches, Rows
 from sgstore.store._schema import INSIDE, add_trace, expected
+from sgstore.store._sql_words import show_is_a
 from sgstore.store._table_files import ParquetTable
 from sgstore.store._temporary_tables import Given, give
 
@@ -130,9 +131,11 @@ class UserSql:
         """Run a function with a connection and the SQL statement, and yield its result."""
 
         def ask(connection: DuckDBPyConnection, until: ExitStack) -> T:
-            if re.search(r"(?i)\btrace\b", self.sql):
+            if re.search(r"(?i)\btraces?\b", self.sql):
                 with self._refused(connection):
                     add_trace(connection)
+            with self._refused(connection):
+                show_is_a(connection, self.sql)
             counted = None if self._given else counted_edges(self.sql)
             given = [(counted[0], {})] if counted else self._given and self._given()
             sql = counted[1] if counted else self.sql

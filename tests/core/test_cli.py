@@ -574,6 +574,42 @@ def test_find_and_check_say_what_settings_left_out(
         assert json.loads(out)
 
 
+@pytest.mark.parametrize(
+    ("statement", "cut"),
+    [
+        (
+            "SELECT min(ttc) FROM pairs",
+            "graph: 25,349 of 36,189 states lie beyond the graphs (50 m)",
+        ),
+        (
+            "SELECT count(*) FROM world_nodes",
+            "world: 3,153 of 36,189 states lie beyond the world (200 m)",
+        ),
+        (
+            "SELECT * FROM sgql('MATCH (e:Ego) RETURN e.kind') LIMIT 1",
+            "graph: 25,349 of 36,189 states lie beyond the graphs (50 m)",
+        ),
+        ("SELECT count(*) FROM frames", ""),
+    ],
+)
+def test_sql_reports_the_states_beyond_its_views(
+    statement: str, cut: str, store: str, sgstore: Any
+) -> None:
+    code, _, err = sgstore("sql", store, statement)
+
+    assert code == 0
+    assert [line for line in err.splitlines() if "scope" in line] == (
+        [f"sgstore: scope {cut}"] if cut else []
+    )
+
+
+def test_sql_notes_groups_of_kinds(store: str, sgstore: Any) -> None:
+    _, out, err = sgstore("sql", store, "SELECT 1 FROM nodes WHERE kind = 'vru'")
+
+    assert out == ""
+    assert "note: kind = 'vru' is a group of kinds (person, bicycle, motorcycle)" in err
+
+
 def test_ingest_and_info_say_what_settings_cut(tmp_path: Path, sgstore: Any) -> None:
     short = tmp_path / "short.toml"
     short.write_text("[range]\nradius = 10\nworld = 20")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 import time
 from contextlib import nullcontext
 from importlib.util import find_spec
@@ -13,7 +14,9 @@ import pytest
 from graph_blocks import RandomTrace, publish
 
 from sgstore.errors import SqlError, StoreError
-from sgstore.store import GivenTable, StoreFile
+from sgstore.model.vocabulary import SUPER_KINDS, kinds_labelled
+from sgstore.store import GivenTable, StoreFile, kind_notes
+from sgstore.store import duckdb as duckdb_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -325,3 +328,43 @@ def test_a_table_that_is_given_holds_the_values_of_its_blocks(
     found = store.rows("FROM mine", given=[given]).values
 
     assert repr(found) == repr(expected * 2)  # NaN is not equal to itself
+
+
+@pytest.mark.parametrize("label", [*SUPER_KINDS, "TwoWheeler", "Pedestrian", "car"])
+def test_is_a_finds_the_kinds_of_a_group(store: Any, label: str) -> None:
+    kinds = kinds_labelled(label)
+    counts = store.user_sql("SELECT kind, count(*) FROM world_nodes GROUP BY kind").rows().values
+    sql = f"SELECT count(*) FROM world_nodes WHERE is_a(kind, '{label}')"
+
+    expected = sum(count for kind, count in counts if kind in kinds)
+    assert store.user_sql(sql).rows().values == [(expected,)]
+
+
+def test_is_a_is_a_function_of_plain_connections(store: Any, tmp_path: Path) -> None:
+    sql = "SELECT count(*) FROM nodes WHERE is_a(kind, 'vehicle')"
+    with duckdb_of(shutil.copy(store.path, tmp_path / "copy.db")) as connection:
+        assert connection.execute(sql).fetchall() == store.user_sql(sql).rows().values
+
+
+def test_is_a_refuses_an_unknown_word(store: Any) -> None:
+    with pytest.raises(SqlError, match="unknown kind or group of kinds: vehicel"):
+        store.user_sql("SELECT count(*) FROM nodes WHERE is_a(kind, 'vehicel')").rows()
+
+
+@pytest.mark.parametrize(
+    ("sql", "notes"),
+    [
+        ("SELECT 1 FROM nodes WHERE kind = 'car'", []),
+        ("SELECT 1 FROM nodes n WHERE n.kind IN ('car', 'vru')", ["is_a(kind, 'vru')"]),
+        ("FROM pairs WHERE dst_kind = 'vehicle'", ["is_a(dst_kind, 'vehicle')"]),
+        ("FROM entities WHERE kind != 'trukc'", ["did you mean 'truck'?"]),
+        ("FROM events WHERE kind = 'collision'", []),
+        ("FROM mine WHERE kind = 'trukc'", []),
+        ("FROM nodes WHERE kind =", []),
+    ],
+)
+def test_a_comparison_with_no_kind_gets_a_note(sql: str, notes: list[str]) -> None:
+    found = kind_notes(sql)
+
+    assert len(found) == len(notes)
+    assert all(part in note for part, note in zip(notes, found, strict=True))

@@ -12,6 +12,7 @@ from pathlib import Path
 import duckdb
 
 import sgstore
+from sgstore.model.vocabulary import OWN_KINDS, SUPER_KINDS
 from sgstore.store import StoreFile
 
 SCHEMA = Path(sgstore.__file__).with_name("schema.sql")
@@ -88,3 +89,13 @@ def test_every_view_but_of_imports_has_an_example() -> None:
 
     assert without <= {"imports", "edge_attributes"}
     assert len(sections) >= 11
+
+
+def test_the_page_lists_the_kinds_and_their_groups() -> None:
+    intro = PAGE.read_text(encoding="utf-8").partition("## ")[0]
+    kinds = re.findall(r"`(\w+)`", intro.partition("**Kinds.** `kind`")[2].partition("Imported")[0])
+    groups = {name: tuple(its.split(", ")) for name, its in re.findall(r"\* `(\w+)`: (.+)", intro)}
+
+    assert tuple(kinds) == OWN_KINDS
+    assert groups.pop("entity") == ("all kinds of entities",)
+    assert groups == {name: its for name, its in SUPER_KINDS.items() if name != "entity"}

@@ -400,6 +400,7 @@ def sql(
     if (url := url_of(store)) is not None:
         with whole.collection_at(url, ask, tables, safe=safe) as opened:
             rows = opened.sql(query_of(statement, file), each=each)
+            say_scope(rows.scope, ask.chosen)
             shown = ((shown_bundle(row[0], ask), *row[1:]) for row in rows)
             ask.write(rows.columns, islice(shown, limit or None))
             say_left_out(rows)
@@ -426,6 +427,7 @@ def sql(
     with opened.file.snapshot():
         asked = UserStatement(opened.find, opened.catalog().tables, query_of(statement, file))
         say_left_out(asked)
+        say_scope(asked.scope(opened.file), ask.chosen)
         _write_sql(asked.on(opened.file), limit, ask)
     return 0
 
