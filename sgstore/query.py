@@ -18,7 +18,7 @@ from sgstore.matches import UnionMatches
 from sgstore.model.criticality import KNOWN
 from sgstore.model.scope import scope_of
 from sgstore.model.vocabulary import normalize_name
-from sgstore.store import FrameRef, StoreFile, UserTables, kind_notes, measured, world_read
+from sgstore.store import FrameRef, StoreFile, UserTables, measured
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -1725,7 +1725,7 @@ class UserStatement:
         self._sql, self._given = text, None
         self._patterns: list[Matches] = []
         self.reasons: dict[str, str] = {}
-        self.notes: tuple[str, ...] = kind_notes(text)
+        self._world, self.notes = StoreFile.about_sql(text)
         if "sgql" not in text.lower():
             return
         from sgstore.lang.syntax import pattern_tables
@@ -1745,10 +1745,9 @@ class UserStatement:
 
     def scope(self, file: StoreFile) -> dict[str, Any]:
         """Data that settings exclude from the views and patterns of the statement, as JSON values."""
-        world = world_read(self._sql)
-        if world is None:
+        if self._world is None:
             return next((one.scope for one in self._patterns), {})
-        return scope_of((one.report for one in file.traces()), world=world)
+        return scope_of((one.report for one in file.traces()), world=self._world)
 
 
 def _png(image: Image) -> bytes:

@@ -56,8 +56,6 @@ from sgstore.store import (
     Tabular,
     Triples,
     UserTables,
-    kind_notes,
-    world_read,
 )
 from sgstore.temporal import CheckRun, TemporalMatches
 
@@ -851,7 +849,7 @@ class CollectionRows(Tabular):
         self._whole, self._text = whole, text
         self._columns: tuple[str, ...] = ()
         self.reasons: dict[str, str] = {}
-        self.notes = kind_notes(text)
+        self._world, self.notes = StoreFile.about_sql(text)
         if "topic" in text.lower():
             self.notes += tuple(_null_fields(whole, text))
         if "sgql" in text.lower():
@@ -882,8 +880,7 @@ class CollectionRows(Tabular):
     @property
     def scope(self) -> dict[str, Any]:
         """Data that settings exclude from the views of the statement, as JSON values."""
-        world = world_read(self._text)
-        return {} if world is None else self._whole.snapshot.scope(world=world)
+        return {} if self._world is None else self._whole.snapshot.scope(world=self._world)
 
     @property
     def columns(self) -> tuple[str, ...]:

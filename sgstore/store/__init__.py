@@ -40,7 +40,6 @@ from sgstore.store._rebuild import OldMap, OldTrace, Remains
 from sgstore.store._rows import Rows, Tabular, count_parquet
 from sgstore.store._schema import SCHEMA_VERSION
 from sgstore.store._similarity import Example, SimilarFrames
-from sgstore.store._sql_words import kind_notes, world_read
 from sgstore.store._staging import Sealed
 from sgstore.store._state_columns import StateColumns
 from sgstore.store._store_paths import Folder
@@ -86,11 +85,9 @@ __all__ = [
     "duckdb",
     "facts_of",
     "graph_digests",
-    "kind_notes",
     "measured",
     "split_segment",
     "subset_catalogs",
     "verify_file",
     "whole_segment",
-    "world_read",
 ]

@@ -310,6 +310,16 @@ class StoreFile:
         return UserSql(RecordingSql(path).answered, sql, timeout_s, None)
 
     @staticmethod
+    def about_sql(sql: str) -> tuple[bool | None, tuple[str, ...]]:
+        """Return if an SQL statement reads views of the world alone, and notes on unknown kinds.
+
+        The first value is False for views of graphs, and ``None`` without such views.
+        """
+        from sgstore.store._sql_words import kind_notes, world_read
+
+        return world_read(sql), kind_notes(sql)
+
+    @staticmethod
     def recorded_topics(path: Path) -> list[str]:
         """Return the names of the topics of a recording, sorted."""
         from sgstore.store._topic_views import topics_in

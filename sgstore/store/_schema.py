@@ -392,8 +392,9 @@ def _any_changed(connection: DuckDBPyConnection, objects: Objects) -> tuple[str,
     views = _expected_views(connection)
     older = (
         {
-            name: views.get(f"{name}:" if name in names else name, "")
-            for name in views.keys() - (NEW_VIEWS & {*names})
+            name: views[f"{name}:"] if name in names else text
+            for name, text in views.items()
+            if name not in NEW_VIEWS or name not in names
         }
         for names in BEFORE_TRACE.values()
     )

@@ -15,8 +15,9 @@ from graph_blocks import RandomTrace, publish
 
 from sgstore.errors import SqlError, StoreError
 from sgstore.model.vocabulary import SUPER_KINDS, kinds_labelled
-from sgstore.store import GivenTable, StoreFile, kind_notes
+from sgstore.store import GivenTable, StoreFile
 from sgstore.store import duckdb as duckdb_of
+from sgstore.store._sql_words import kind_notes
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
