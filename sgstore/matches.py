@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import re
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections import defaultdict, namedtuple
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
@@ -47,7 +47,7 @@ from sgstore.lang.sql import (
 from sgstore.model.frame_ids import FRAME_BITS, SEQ_BITS
 from sgstore.model.scope import scope_of
 from sgstore.model.vocabulary import natural
-from sgstore.model.world import Clip, tolerance_ns
+from sgstore.model.world import Clip, longest_step_ns, tolerance_ns
 from sgstore.store import (
     FrameRef,
     GivenTable,
@@ -164,7 +164,7 @@ class Matches(Tabular):
     """Matches of a query. Iteration yields rows. Each call of a method runs a new search.
 
     ``count``, ``frames`` and ``clips`` cover all matching frames; ``RETURN`` has no effect on them. With
-    ``LIMIT``, they cover the frames of the listed rows.
+    ``LIMIT``, they cover the frames of the listed rows, and ``intervals`` yields intervals with such a frame.
 
     Rows are named tuples with one field per column. Characters that a field name cannot have become ``_``. The
     column ``e.name`` is ``row.e_name``.
@@ -529,8 +529,8 @@ class Matches(Tabular):
     def frames(self) -> Iterator[FrameRef]:
         """Yield each matching frame once, ordered by trace name and frame number.
 
-        Limited rows keep their order. If ``RETURN INTERVALS`` has a limit or ``HAVING``, only frames in the
-        chosen intervals are yielded.
+        Limited rows keep their order. If ``RETURN INTERVALS`` or ``CLIPS`` has a limit or ``HAVING``, only
+        frames in the chosen intervals or clips are yielded.
 
         Examples
         --------
@@ -539,17 +539,27 @@ class Matches(Tabular):
         town 0 0.0
         town 1 0.1
         """
-        for frame_id, trace, seq, time_ns, t, log_time_ns in self._frames():
-            yield FrameRef(frame_id, frame_id >> SEQ_BITS, trace, seq, time_ns, log_time_ns, t)
+        yield from map(_frame_of, self._frames())
 
     def _frames(self) -> Iterator[tuple[Any, ...]]:
         with self._compiled() as compiled:
             rows = self._answered("frames")
             if compiled.limited_to_frames is not None:
                 rows = dict.fromkeys((*row[: len(FRAME_COLUMNS)], row[-1]) for row in rows)
-            elif compiled.drops_intervals:
-                rows = _rows_within(rows, self.intervals())
+            elif compiled.drops_runs:
+                rows = self._in_runs(rows, self._answered("rows"))
             yield from rows
+
+    def _in_runs(
+        self, frames: Iterable[tuple[Any, ...]], runs: Iterable[tuple[Any, ...]]
+    ) -> Iterator[tuple[Any, ...]]:
+        """Yield the rows of frames that lie in one of some rows of intervals or clips."""
+        result = self._ready.query.result
+        spans, place = ((run[0], run[1], run[2]) for run in runs), _SEQ_PLACE
+        if result.form == "clips":
+            spans = ((trace, a - result.before, b - result.after) for trace, a, b in spans)
+            place = _LOG_PLACE
+        return _rows_within(frames, spans, place)
 
     def bindings(self, frame: FrameRef) -> list[dict[str, int]]:
         """Return all bindings in one frame: variable name → node id. ``RETURN`` has no effect.
@@ -675,7 +685,10 @@ class Matches(Tabular):
         with self._compiled() as compiled:
             width = len(INTERVAL_COLUMNS)
             names = self._columns_of(compiled, form)[width:]
-            for row in self._answered(form):
+            rows = self._answered(form)
+            if compiled.drops_frames and compiled.query.result.form != "intervals":
+                rows = _with_frames(rows, ((row[1], row[2]) for row in self._frames()), tuple)
+            for row in rows:
                 yield Interval(*row[:width], values=dict(zip(names, row[width:], strict=True)))
 
     @property
@@ -747,14 +760,27 @@ class Matches(Tabular):
         """
         start, end = round(before * 1e9), round(after * 1e9)
         with self._compiled() as compiled:
-            if compiled.drops_frames:
-                frames = ((row[1], row[-1]) for row in self._frames())
-                around = (Clip(trace, time - start, time + end) for trace, time in frames)
-                clips = sorted(around, key=lambda clip: (natural(clip.trace), clip.start_ns))
-                yield from merged(clips, self._slack)
+            if compiled.drops_frames and compiled.query.result.form != "clips":
+                yield from self._clips_of(self.frames(), start, end)
                 return
             rows = self._answered("clips", (start, end))
             yield from merged((Clip(*row[:3]) for row in rows), self._slack)
+
+    def _clips_of(self, frames: Iterable[FrameRef], before: int, after: int) -> Iterator[Clip]:
+        """Yield clips around the runs of frames, as :meth:`clips`; the offsets are in ns."""
+        longest = {one.name: longest_step_ns(one.period_ns) for one in self._ready.catalog.traces}
+        clips, last = list[Clip](), None
+        for one in sorted(frames, key=_place):
+            first = one.log_time_ns - before
+            if (
+                last is not None
+                and (one.trace_id, one.seq) == (last.trace_id, last.seq + 1)
+                and one.time_ns - last.time_ns <= longest[one.trace]
+            ):
+                first = clips.pop().start_ns
+            clips.append(Clip(one.trace, first, one.log_time_ns + after))
+            last = one
+        yield from merged(clips, self._slack)
 
     @property
     def _slack(self) -> dict[str, int]:
@@ -1099,21 +1125,47 @@ class UnionMatches(Matches):
         return sum(1 for _ in self.frames())
 
     def frames(self) -> Iterator[FrameRef]:
-        """Yield the matching frames of all single queries by trace and number, without duplicates."""
+        """Yield the matching frames of all single queries by trace and number, without duplicates.
 
-        def key(frame: FrameRef) -> tuple[Any, int]:
-            return natural(frame.trace), frame.seq
+        After :meth:`limit`, these are the frames of the listed rows.
 
+        Raises
+        ------
+        QueryError
+            The rows are limited, and have no frame.
+        """
         with self._file.snapshot():
+            listed = None if self._limit is None else self._rows(whole=False)
+            each = zip(self._rows_of_frames(listed), self._results, strict=True)
             parts = [
-                sorted(part.frames(), key=key) if result.chooses else part.frames()
-                for part, result in zip(self._parts, self._results, strict=True)
+                sorted(map(_frame_of, rows), key=_place) if result.chooses else map(_frame_of, rows)
+                for rows, result in each
             ]
             last = None
-            for frame in merge(*parts, key=key):
+            for frame in merge(*parts, key=_place):
                 if frame.frame_id != last:
                     last = frame.frame_id
                     yield frame
+
+    def _rows_of_frames(self, listed: Iterable[Row] | None) -> Iterator[Iterator[tuple[Any, ...]]]:
+        """Yield the rows of frames of each part; only frames in rows of the union, if these are given."""
+        result = self._results[0]
+        rows = None if listed is None or result.aggregated else list(listed)
+        if rows and not result.names:
+            raise QueryError(
+                "limited rows of a UNION have no frames",
+                text=self._text,
+                hint="RETURN FRAMES and the values in each part, or LIMIT in each part",
+            )
+        for part in self._parts:
+            frames = part._frames()  # noqa: SLF001
+            if rows is None:
+                yield frames
+            elif result.names == FRAME_COLUMNS:
+                chosen = {row[0] for row in rows}
+                yield (one for one in frames if one[0] in chosen)
+            else:
+                yield part._in_runs(frames, rows)  # noqa: SLF001
 
     def bindings(self, frame: FrameRef) -> list[dict[str, int]]:
         """Return the bindings of all single queries in one frame: variable name → node id."""
@@ -1146,7 +1198,11 @@ class UnionMatches(Matches):
         """Yield the intervals of all single queries by trace and start; see :meth:`Matches.intervals`."""
         with self._file.snapshot():
             parts = [self._in_time(part.intervals(bound=bound), _begin) for part in self._parts]
-            yield from self._merged(parts, _begin, repr)
+            found = self._merged(parts, _begin, repr)
+            if self._limit is not None:
+                frames = ((one.trace, one.seq) for one in self.frames())
+                found = _with_frames(found, frames, _span)
+            yield from found
 
     @property
     def lists(self) -> Literal["matches", "chosen", "values"]:
@@ -1161,7 +1217,13 @@ class UnionMatches(Matches):
     def clips(self, before: float = 0.0, after: float = 0.0) -> Iterator[Clip]:
         """Yield clips around the matching frames of all single queries. Overlapping clips are merged."""
         with self._file.snapshot():
+            if self._limit is not None and self._results[0].form != "clips":
+                offsets = round(before * 1e9), round(after * 1e9)
+                yield from self._parts[0]._clips_of(self.frames(), *offsets)  # noqa: SLF001
+                return
             parts = [part.clips(before, after) for part in self._parts]
+            if self._limit is not None:
+                parts = [[Clip(*row[:3])] for row in self._rows(whole=False)]
             found = merge(*parts, key=lambda clip: (natural(clip.trace), clip.start_ns))
             yield from merged(found, self._parts[0]._slack)  # noqa: SLF001
 
@@ -1194,6 +1256,10 @@ class UnionMatches(Matches):
         """Explain each single query of the union, stage by stage."""
         word = "UNION" if self._distinct else "UNION ALL"
         return f"\n\n==== {word}\n\n".join(part.explain() for part in self._parts)
+
+
+def _span(interval: Interval) -> tuple[str, int, int]:
+    return interval.trace, interval.start_seq, interval.end_seq
 
 
 def _begin(interval: Interval) -> tuple[Any, int]:
@@ -1330,12 +1396,41 @@ class Windows:
         self._size = max(min(grown, used * ROWS // max(self.rows, 1), LAST_WINDOW), 1)
 
 
+_SEQ_PLACE: Final = FRAME_COLUMNS.index("seq")
+_LOG_PLACE: Final = len(FRAME_COLUMNS)
+"""Places of the frame number and of the log time in rows of frames."""
+
+
+def _frame_of(row: tuple[Any, ...]) -> FrameRef:
+    frame_id, trace, seq, time_ns, t, log_time_ns = row
+    return FrameRef(frame_id, frame_id >> SEQ_BITS, trace, seq, time_ns, log_time_ns, t)
+
+
+def _place(frame: FrameRef) -> tuple[Any, int]:
+    return natural(frame.trace), frame.seq
+
+
+def _with_frames(
+    intervals: Iterable[T], frames: Iterable[tuple[str, int]], span: Callable[[T], tuple[Any, ...]]
+) -> Iterator[T]:
+    """Yield the intervals that contain one of some frames, given by trace and number.
+
+    ``span`` returns trace, first and last frame of an interval, and may return more.
+    """
+    chosen = sorted(frames)
+    for one in intervals:
+        trace, first, last, *_ = span(one)
+        at = bisect_left(chosen, (trace, first))
+        if at < len(chosen) and chosen[at] <= (trace, last):
+            yield one
+
+
 def _rows_within(
-    rows: Iterable[tuple[Any, ...]], intervals: Iterable[Interval]
+    rows: Iterable[tuple[Any, ...]], runs: Iterable[tuple[str, int, int]], place: int
 ) -> Iterator[tuple[Any, ...]]:
-    """Yield the rows whose frame lies in one of the given intervals."""
+    """Yield the rows of frames whose number or log time, at a place of the row, lies in one of some runs."""
     spans = defaultdict[str, list[tuple[int, int]]](list)
-    for trace, start, end in sorted((one.trace, one.start_seq, one.end_seq) for one in intervals):
+    for trace, start, end in sorted(runs):
         known = spans[trace]
         if known and start <= known[-1][1]:
             known[-1] = known[-1][0], max(known[-1][1], end)
@@ -1343,8 +1438,8 @@ def _rows_within(
             known.append((start, end))
     for row in rows:
         known = spans.get(row[1], [])
-        at = bisect_right(known, row[2], key=itemgetter(0))
-        if at and row[2] <= known[at - 1][1]:
+        at = bisect_right(known, row[place], key=itemgetter(0))
+        if at and row[place] <= known[at - 1][1]:
             yield row
 
 

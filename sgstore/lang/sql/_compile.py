@@ -210,15 +210,15 @@ class Compiled:
         return replace(self, query=replace(self.query, result=result))
 
     @property
-    def drops_intervals(self) -> bool:
-        """True if the query returns intervals, and a limit or condition removes some of them."""
+    def drops_runs(self) -> bool:
+        """True if the query returns intervals or clips, and a limit or condition removes some of them."""
         result = self.query.result
-        return result.form == "intervals" and result.chooses and not result.aggregated
+        return result.form in {"intervals", "clips"} and result.chooses and not result.aggregated
 
     @property
     def drops_frames(self) -> bool:
         """True if a limit or a condition removes matching frames from the result."""
-        return self.limited_to_frames is not None or self.drops_intervals
+        return self.limited_to_frames is not None or self.drops_runs
 
     @property
     def listed(self) -> Compiled | None:
