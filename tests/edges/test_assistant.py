@@ -418,13 +418,15 @@ def test_tools_find_what_the_store_finds(tools: StoreTools, town_store: Path) ->
 
 
 def test_an_answer_tells_that_there_is_more_and_what_cannot_answer(tools: StoreTools) -> None:
-    few = tools.find(NEAR, limit=2)
+    few = tools.find(NEAR, form="intervals", limit=2)
     noted = tools.find("MATCH (e:Ego) WHERE trace.map = 'Town4'")
     wide = tools.sql("SELECT repeat('x', 350) AS x FROM range(500)", limit=500)
 
     assert few.data["truncated"]
     assert len(few.data["rows"]) == 2
-    assert "the first 2 rows; there are more" in few.text
+    assert few.data["total"] == len(tools.find(NEAR, form="intervals").data["rows"]) > 2
+    assert f"the first 2 of {few.data['total']} rows" in few.text
+    assert "(the first 2 rows; there are more" in tools.find(NEAR, form="rows", limit=2).text
     assert noted.text.startswith("nothing\n(note: ")
     assert len(wide.text) < 32_000
     assert re.search(r"\(\d+ of 500 rows: the answer is full", wide.text)
@@ -535,10 +537,26 @@ def test_topics_of_the_vocabulary_say_what_there_is(topic: Any, tools: StoreTool
         "attributes": "  light_state: ",
         "functions": "  ttc(a, b): ",
         "predicates": "stopped(",
-        "views": "frames(frame_id bigint",
+        "views": "frames: One row a frame",
     }
 
     assert words[topic] in tools.vocabulary(topic).text
+
+
+def test_the_vocabulary_lists_views_and_then_one_view(tools: StoreTools) -> None:
+    views = tools.vocabulary("views").text
+    node = tools.vocabulary("views", "Nodes").text
+    named = tools.vocabulary("views", "ttc").text
+
+    assert len(views) < 3_000
+    assert views.count("\n") > 20
+    assert node.startswith("nodes(frame_id bigint, node_id integer, kind word")
+    assert node.endswith("trace: name of the recording.")
+    assert "\npairs: One row" in f"\n{named}"
+    assert "; ttc double" in named
+    assert "\nnodes:" not in named
+    assert tools.vocabulary("views", "zebra").text == "no line has 'zebra'"
+    assert tools.topic("views") == views
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
 
 from pydantic import Field
 
-from sgstore.apps.assistant._vocabulary import Topic, topic_text
+from sgstore.apps.assistant._vocabulary import Topic, topic_text, with_word
 from sgstore.apps.sandbox import TIMEOUT_S, Sandbox
 from sgstore.apps.verbs import seconds
 from sgstore.base.display import cell
@@ -187,17 +187,17 @@ class StoreTools:
             here: kinds and relations in this store; language: how to write a query, in one page;
             topics: recorded topics and their fields; others: what a query may name
         word
-            only lines with this word
+            only lines with this word; for views: a view, with its columns, or a column
         """
-        lines = [one for one in self.topic(about).splitlines() if word.lower() in one.lower()]
-        text = _first_lines(lines) if lines else f"no line has {word!r}"
+        text = _first_lines(self.topic(about, word).splitlines()) or f"no line has {word!r}"
         return ToolAnswer(text, {"about": about, "text": text})
 
-    def topic(self, about: Topic) -> str:
+    def topic(self, about: Topic, word: str = "") -> str:
         """Return an explanation of a topic of the query language, such as relations or functions."""
         if about == "language":
-            return self._language
-        return topic_text(about, self._ask("views" if about == "views" else "vocabulary"))
+            return with_word(self._language, word)
+        known = self._ask("views" if about == "views" else "vocabulary")
+        return topic_text(about, known, word)
 
     @cached_property
     def _language(self) -> str:
@@ -282,7 +282,7 @@ class StoreTools:
     ) -> ToolAnswer:
         """Run a read-only SQL statement on the views of the store.
 
-        The dialect is DuckDB's; vocabulary 'views' lists the views with their columns.
+        The dialect is DuckDB's; vocabulary 'views' lists the views; with word='nodes' the columns of one.
 
         Parameters
         ----------
@@ -337,7 +337,9 @@ class StoreTools:
         ]
         lines = [line for one in found for line in lines_of(one)]
         if reply["truncated"]:
-            lines.append(f"(the first {TRACES_DRAWN} traces; name others in traces)")
+            lines.append(
+                f"(the first {TRACES_DRAWN} of {reply['total']} traces; name others in traces)"
+            )
         unknown = {one.trace: lane.reason for one in found for lane in one.lanes if lane.reason}
         text = "\n".join([*map(_one_line, lines), *_remarks({"left_out": unknown})])
         image = self._drawn(lambda to: draw_timelines(found, to)) if picture and found else b""
@@ -517,7 +519,7 @@ class StoreTools:
         rows = [self._from_start(one.as_row()) for one in written]
         losses = [f"{one.file.name}: lost: {loss.reason}" for one in written for loss in one.losses]
         listed = {"columns": [*rows[0]], "rows": [[*row.values()] for row in rows]}
-        about = {**listed, "truncated": reply["truncated"], "left_out": reply["left_out"]}
+        about = listed | {name: reply[name] for name in ("truncated", "total", "left_out")}
         about["notes"] = [*reply["notes"], *losses]
         return ToolAnswer(_rows_text(about), finite(about))
 
@@ -539,7 +541,7 @@ def _first_lines(lines: Sequence[str]) -> str:
     """Return the first lines of a long text, with a note on the others."""
     sizes = accumulate(len(one) + 1 for one in lines)
     shown = max(sum(size <= MOST_TEXT for size in sizes), 1)
-    rest = len(lines) - shown
+    rest = max(len(lines) - shown, 0)
     note = [f"({rest} more lines: add word='…' to list those with a word)"] if rest else []
     return "\n".join([*(one[:MOST_TEXT] for one in lines[:shown]), *note])
 
@@ -556,7 +558,7 @@ def _rows_text(reply: Mapping[str, Any]) -> str:
     Parameters
     ----------
     reply : mapping
-        ``columns``, ``rows``, ``truncated``; optionally ``notes`` and ``left_out``.
+        ``columns``, ``rows``, ``truncated``; optionally ``total``, ``notes`` and ``left_out``.
     """
     rows = reply["rows"]
     lines, shown = _lines(reply["columns"], rows)
@@ -566,9 +568,11 @@ def _rows_text(reply: Mapping[str, Any]) -> str:
             f"({shown} of {len(rows)} rows: the answer is full; return fewer values per row)"
         )
     elif reply["truncated"]:
-        told.append(
-            f"(the first {len(rows)} rows; there are more: raise limit, count, or narrow it)"
-        )
+        advice = "raise limit, or narrow it"
+        if (total := reply.get("total")) is None:
+            told.append(f"(the first {len(rows)} rows; there are more: count them, {advice})")
+        else:
+            told.append(f"(the first {len(rows)} of {total} rows: {advice})")
     return "\n".join([*told, *_remarks(reply)])
 
 

@@ -31,7 +31,7 @@ TOPICS: Final[tuple[Topic, ...]] = get_args(Topic)
 _SIGNATURE: Final = re.compile(r"PREDICATE\s+(\w+\s*\([^)]*\))")
 
 
-def topic_text(about: Topic, known: Mapping[str, Any]) -> str:
+def topic_text(about: Topic, known: Mapping[str, Any], word: str = "") -> str:
     """Return an explanation of a topic of the query language for an assistant.
 
     Parameters
@@ -40,9 +40,22 @@ def topic_text(about: Topic, known: Mapping[str, Any]) -> str:
         Any topic except ``language``, which is a page.
     known : mapping
         Facts about the store from the sandbox; see :mod:`sgstore.apps.assistant._worker`.
+    word : str
+        Only lines with this word. The name of a view selects this view with its columns.
     """
+    if about == "views":
+        return _views(known["views"], word)
+    return with_word(_topic(about, known), word)
+
+
+def with_word(text: str, word: str) -> str:
+    """Return the lines of a text that contain a word, in any case."""
+    return "\n".join(line for line in text.splitlines() if word.lower() in line.lower())
+
+
+def _topic(about: Topic, known: Mapping[str, Any]) -> str:
     always = {"relations": _relations, "functions": _functions, "predicates": _predicates}
-    here = {"attributes": _attributes, "views": _views, "topics": _topics}
+    here = {"attributes": _attributes, "topics": _topics}
     return always[about]() if about in always else here.get(about, _here)(known)
 
 
@@ -136,8 +149,17 @@ def _predicates() -> str:
     return "\n".join(lines)
 
 
-def _views(known: Mapping[str, Any]) -> str:
-    return "\n".join(
-        f"{name}({', '.join(one['columns'])}): {one['meaning']}"
-        for name, one in known["views"].items()
-    )
+def _views(views: Mapping[str, Any], word: str) -> str:
+    """Return one view with its columns, or the first sentence on each view that has the word.
+
+    Columns with the word follow the sentence.
+    """
+    if (view := views.get(word.lower())) is not None:
+        return f"{word.lower()}({', '.join(view['columns'])}): {view['meaning']}"
+    lines = [] if word else ["Columns of a view, with types and meanings: word='nodes'"]
+    for name, view in views.items():
+        line = f"{name}: {view['meaning'].partition('. ')[0].removesuffix('.')}"
+        columns = [one for one in view["columns"] if word and word.lower() in one.lower()]
+        if columns or word.lower() in line.lower():
+            lines.append("; ".join([line, *columns]))
+    return "\n".join(lines)

@@ -1,8 +1,9 @@
 """Queries of an AI assistant, run in the sandbox process.
 
 A query is ``{"ask": NAME, "with": {…}}``, where the name is a key of :data:`ANSWERS`. A reply with
-a list has ``columns`` and ``rows``, ``truncated`` if there are more rows, ``left_out`` with the
-traces that cannot answer and their reasons, and ``notes``.
+a list has ``columns`` and ``rows``, ``truncated`` if there are more rows, ``total`` with the number
+of all rows (not for rows of a query or of SQL, which are read only up to the limit), ``left_out``
+with the traces that cannot answer and their reasons, and ``notes``.
 """
 
 from __future__ import annotations
@@ -46,10 +47,23 @@ _OF_TRACES: Final = {"find", "check"}
 def _listed(
     columns: Sequence[str], rows: Iterable[Sequence[Any]], limit: int, **about: Any
 ) -> Reply:
-    """Return a reply with the rows up to a limit, and a flag that states if there are more rows."""
+    """Return a reply with the rows up to a limit, and the number of all rows."""
+    some = iter(rows)
+    found = list(islice(some, limit))
+    total = len(found) + sum(1 for _ in some)
+    return _cut(columns, found, truncated=total > limit) | {"total": total, **about}
+
+
+def _listed_first(
+    columns: Sequence[str], rows: Iterable[Sequence[Any]], limit: int, **about: Any
+) -> Reply:
+    """Return a reply with the rows up to a limit. Other rows are not read."""
     found = list(islice(rows, limit + 1))
-    truncated = len(found) > limit
-    return {"columns": columns, "rows": found[:limit], "truncated": truncated, **about}
+    return _cut(columns, found[:limit], truncated=len(found) > limit) | about
+
+
+def _cut(columns: Sequence[str], rows: Sequence[Sequence[Any]], *, truncated: bool) -> Reply:
+    return {"columns": columns, "rows": rows, "truncated": truncated}
 
 
 def _named(text: str, parameters: Mapping[str, Any], *, check: bool) -> tuple[str, dict[str, Any]]:
@@ -111,12 +125,13 @@ def _find(store: Store, limit: int, query: str, parameters: Mapping[str, Any], f
         return _listed(("frame", "t"), frames, limit, **about)
     if form == "intervals":
         return _listed(*intervals_for_people(matches.intervals()), limit, **about)
-    return _listed(*for_people(matches.columns, matches, graphs=matches.graphs), limit, **about)
+    rows = for_people(matches.columns, matches, graphs=matches.graphs)
+    return _listed_first(*rows, limit, **about)
 
 
 def _sql(store: Store, limit: int, statement: str) -> Reply:
     rows = store.sql(statement, max_rows=limit)
-    listed = _listed(rows.columns, rows.values, limit, left_out=dict(rows.reasons))
+    listed = _listed_first(rows.columns, rows.values, limit, left_out=dict(rows.reasons))
     return listed | {"truncated": rows.truncated}
 
 
@@ -136,19 +151,15 @@ def _check(store: Store, limit: int, text: str, parameters: Mapping[str, Any]) -
     run = store.check(asked, **values)
     told: dict[str, Any] = {"margin": run.quantitative, "returned": columns_returned(run.returned)}
     tally: Counter[str] = Counter()
-    rows, unknown, truncated = list[tuple[Any, ...]](), dict[str, str](), False
+    rows, unknown, total = list[tuple[Any, ...]](), dict[str, str](), 0
     for verdict in run:
         tally[verdict.verdict] += 1
         if verdict.reason:
             unknown[verdict.trace] = verdict.reason
-        own = list(islice(verdict_rows(verdict, **told), limit + 1 - len(rows)))
-        rows += own
-    truncated = len(rows) > limit
-    listed = {
-        "columns": verdict_columns(**told),
-        "rows": rows[:limit],
-        "truncated": truncated,
-    }
+        own = list(verdict_rows(verdict, **told))
+        rows += own[: limit - len(rows)]
+        total += len(own)
+    listed = _cut(verdict_columns(**told), rows, truncated=total > limit) | {"total": total}
     return {**listed, "verdicts": dict(tally), "left_out": unknown, "notes": run.notes}
 
 
@@ -181,7 +192,7 @@ def _timeline(store: Store, limit: int, queries: Sequence[str], traces: Sequence
 
     only = [store.file.trace(name).name for name in traces]
     found = [asdict(one) for one in timelines(store, by_lane(queries, {}), only)]
-    return {"timelines": found[:limit], "truncated": len(found) > limit}
+    return {"timelines": found[:limit], "truncated": len(found) > limit, "total": len(found)}
 
 
 def _missing(  # noqa: PLR0913, PLR0917  what coverage is measured of, and by
