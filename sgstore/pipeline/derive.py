@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shlex
 from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import TYPE_CHECKING, Any, Final
@@ -150,7 +151,11 @@ def keep_abstraction(
     """
     abstraction = abstraction_named(name)
     if abstraction.name in SUBSETS:
-        raise AbstractionError(f"queries can name {abstraction.name!r} as it is: USING ABSTRACTION")
+        query = f"USING ABSTRACTION {abstraction.name} MATCH (e:Ego)"
+        raise AbstractionError(
+            f"queries use the abstraction {abstraction.name!r} without a derived set; write:"
+            f" {shlex.join(['sgstore', 'find', str(store), query])}"
+        )
     file, chosen = _chosen(store, traces)
     known = {(one.name, one.trace_id) for one in file.deriving.sets()}
     results: list[Derivation] = []

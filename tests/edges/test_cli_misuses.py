@@ -254,3 +254,16 @@ def test_suggestions_work(
     assert unusable == []
     assert many["line"] > (150 if LONG else 8), many
     assert many["second"] <= (25 if LONG else 5), many
+
+
+def test_an_abstraction_without_a_derived_set_is_answered_with_its_query(
+    files: dict[str, str], capsysbinary: pytest.CaptureFixture[bytes]
+) -> None:
+    code, lines, suggestion = answered(
+        ["derive", files["store"], "--abstraction", "RSV"], capsysbinary
+    )
+
+    assert code == 1
+    assert "without a derived set" in lines[0]
+    assert suggestion is not None
+    assert run(shlex.split(suggestion)[1:]) == 0

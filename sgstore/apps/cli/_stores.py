@@ -171,7 +171,10 @@ def derive(
     given = graphs.config or graphs.preset
     if abstraction is not None:
         if name is not None or remove is not None or given or force:
-            raise typer.BadParameter("--abstraction NAME can be combined only with --trace")
+            raise typer.BadParameter(
+                "--abstraction NAME can be combined only with --trace: the set has the name of the"
+                " abstraction; settings need --name NAME without --abstraction"
+            )
         kept = keep_abstraction(store, abstraction, trace or ())
         return _write_derived(kept, out)
     if name is None or remove is not None:
