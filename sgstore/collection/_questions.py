@@ -32,6 +32,8 @@ from sgstore.collection._storage import place_at
 from sgstore.errors import QueryError, SqlError, StoreError, one_store_needed, reason_of
 from sgstore.lang.bind import CLASSES_GIVEN
 from sgstore.lang.catalog import TableFacts, Type
+from sgstore.lang.ir import TraceAttribute, walk
+from sgstore.lang.memory import Binding, FrameView, expression
 from sgstore.lang.sql import (
     joined_rows,
     traces_of,
@@ -42,6 +44,7 @@ from sgstore.lang.syntax import pattern_tables, topic_tables, topics_in_sql
 from sgstore.lang.topics import topic_of, unknown_topic
 from sgstore.matches import UnionMatches
 from sgstore.model.frame_ids import SEQ_BITS, trace_of
+from sgstore.model.graph import SceneGraph
 from sgstore.model.vocabulary import natural
 from sgstore.query import Store, StoreVerbs, matches_of
 from sgstore.store import (
@@ -69,7 +72,7 @@ if TYPE_CHECKING:
     from sgstore.collection._catalogue import Snapshot
     from sgstore.collection._engines import Engine
     from sgstore.lang.catalog import Catalog, Triple
-    from sgstore.lang.ir import Scope
+    from sgstore.lang.ir import Bound, Scope
     from sgstore.lang.sql import Compiled
     from sgstore.lang.sql.collection_pruning import ClassQuestion
     from sgstore.lang.syntax import Pattern
@@ -626,8 +629,22 @@ class CollectionMatches(TemporalMatches):
     @property
     def reasons(self) -> dict[str, str]:
         """Return the traces that cannot answer the query, each with the reason."""
-        found = {**self._ready.reasons, **self._reasons}
+        found = self._of_chosen(self._ready, {**self._ready.reasons, **self._reasons})
         return {name: found[name] for name in sorted(found, key=natural)}
+
+    def _traces_with(self, conditions: list[Bound]) -> set[str]:
+        """Return the names of traces that meet conditions, as far as the catalogue has the attributes."""
+        known = [one for one in conditions if not any(map(_is_uncatalogued, walk(one)))]
+        tests = [expression(one, injective=False) for one in known]
+        found: set[str] = set()
+        for row in self.snapshot.traces:
+            about = {name: row[name] for name in ("name", "ego", "frames", "map")}
+            about |= {"id": row["trace_id"], "period": row["period_ns"] / 1e9}
+            about["duration"] = (row["end_ns"] - row["start_ns"]) / 1e9
+            at = Binding(FrameView(SceneGraph(0, "", 0, 0, None, {}, []), trace=about))
+            if all(test(at) is True for test in tests):
+                found.add(row["name"])
+        return found
 
     @property
     def scope(self) -> dict[str, Any]:
@@ -731,6 +748,11 @@ class CollectionMatches(TemporalMatches):
 
 
 _INTERVAL_FORMS: Final = {"intervals", "bound"}
+
+
+def _is_uncatalogued(part: Bound) -> bool:
+    """True for an attribute of a trace that the catalogue of a collection does not have."""
+    return isinstance(part, TraceAttribute) and part.attribute.name in {"flavour", "uri"}
 
 
 class CollectionUnion(UnionMatches):

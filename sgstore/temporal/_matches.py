@@ -150,11 +150,18 @@ class TemporalMatches(Matches):
                 if trace.trace_id in lacks:
                     told = [found[trace.name]] if trace.name in found else []
                     found[trace.name] = "; ".join([*told, lacks[trace.trace_id]])
-            conditions = _about_trace(compiled.bound) if found else []
-            if conditions:
-                names = {name for (name,) in self._file.rows(*named_traces(conditions)).values}
-                found = {name: reason for name, reason in found.items() if name in names}
-        return found
+        return self._of_chosen(compiled, found)
+
+    def _of_chosen(self, compiled: Compiled, reasons: dict[str, str]) -> dict[str, str]:
+        """Return only the reasons of traces that meet the conditions of the query on traces."""
+        conditions = _about_trace(compiled.bound) if reasons else []
+        if not conditions:
+            return reasons
+        names = self._traces_with(conditions)
+        return {name: reason for name, reason in reasons.items() if name in names}
+
+    def _traces_with(self, conditions: list[Bound]) -> set[str]:
+        return {name for (name,) in self._file.rows(*named_traces(conditions)).values}
 
     def _lacking(self, compiled: Compiled) -> dict[int, str]:
         return lacking(self._file, compiled.catalog, of_query(compiled.bound))

@@ -824,3 +824,28 @@ def test_ray_is_started_again_once(
     assert [one["bundle"] for one in found if one.get("error") == "broken"] == ["bad"] * (
         not failed
     )
+
+
+@pytest.mark.parametrize(
+    "condition",
+    [
+        "trace.name = 'trace3'",
+        "trace.name IN ['trace1', 'trace2'] AND a.x > 0",
+        "NOT trace.name STARTS WITH 'trace' OR trace.frames > 1000000",
+        "trace.duration > 0 AND trace.period < 1 AND trace.ego = 'hero1'",
+        "trace.map IS NULL AND trace.id > 0",
+        "trace.flavour = 'osi'",
+    ],
+)
+def test_traces_that_the_query_excludes_need_no_reason(
+    condition: str, whole: Collection, store: Store
+) -> None:
+    query = f"MATCH (a)-[:sees]->(b:Bicycle) WHERE {condition}"
+    one, other = whole.find(query), store.find(query)
+    every = store.find("MATCH (a)-[:sees]->(b:Bicycle)").reasons
+    at_once = one.reasons
+    one.count()
+
+    assert len(every) > 1
+    assert one.reasons == other.reasons
+    assert "flavour" in condition or at_once == other.reasons
