@@ -12,6 +12,7 @@ from oracle_over_time import worlds
 from recordings import Recorder, car
 
 from sgstore.apps.cli import run as run_verb
+from sgstore.errors import QueryError
 from sgstore.graphs.online import Frame
 from sgstore.ingest import ingest
 from sgstore.lang.bind import MOTION
@@ -145,6 +146,10 @@ def test_numbers_of_two_need_what_they_are_made_of(
 WITHOUT_EGO = {
     "ALWAYS ego.speed < 20": "it has no ego",
     "ALWAYS NOT EXISTS {(ego)-[:collides]-(:Vehicle)}": "it has no ego",
+    "ALWAYS NOT EXISTS {(:Ego)-[:collides]-(:Vehicle)}": "it has no ego",
+    "FORALL (v:Vehicle) ALWAYS NOT EXISTS {(e:Ego)-[:collides]-(v)}": "it has no ego",
+    "ALWAYS NOT EXISTS {(e:Ego) WHERE e.speed > 99}": "it has no ego",
+    "ALWAYS NOT EXISTS {(e:Ego)} OR EXISTS {(:Ego)}": "",
     "FORALL (v:Vehicle) ALWAYS NOT dist(ego, v) < 1": "it has no ego",
     "FORALL (v:Vehicle) ALWAYS v.speed < 20": "",
     "FORALL (p:Person) ALWAYS p.speed < 3": "",
@@ -300,3 +305,31 @@ def test_swim_lanes_tell_what_a_trace_cannot_answer_from_what_is_not_found(
     assert "match is unknown of without: it has no ego" in err
     assert re.search(r"^with  0 .*\n  nothing$", out, re.MULTILINE)
     assert re.search(r"^without  0 .*\n  match  ·+  unknown$", out, re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    "word", ["EXISTS {{{}-[:near]->(v:Vehicle)}}", "COUNT {{{}-[:near]->(v:Car)}} > 1"]
+)
+@pytest.mark.parametrize(
+    "start", ["ALWAYS", "ALWAYS NOT", "FORALL (w:Car) ALWAYS dist(ego, w) > 9 OR"]
+)
+def test_the_label_of_the_ego_in_braces_of_a_check_is_the_ego(
+    word: str, start: str, open_town: Store
+) -> None:
+    named, bare, ego = (
+        [
+            (one.trace, one.verdict, one.violations, one.witnesses, one.reason)
+            for one in open_town.check(f"CHECK c: {start} {word.format(node)}")
+        ]
+        for node in ("(e:Ego)", "(:Ego)", "(ego)")
+    )
+
+    assert named == bare == ego
+    assert ego[0][1] != "unknown"
+
+
+def test_other_spellings_of_the_ego_are_answered_with_it(open_town: Store) -> None:
+    with pytest.raises(QueryError, match=r"\(EGO\) matches any node") as caught:
+        open_town.find("MATCH (EGO)-[:near]->(v:Vehicle)")
+
+    assert caught.value.hint == "write the ego as (ego), or as a label: (e:Ego)"

@@ -86,6 +86,7 @@ def bind_checks(
 def _check(written: WrittenCheck, name: str, session: Session, catalog: Catalog) -> b.BoundCheck:
     settings = chosen(written.settings, session, catalog)
     session.look_beyond(catalog, world=settings.scope != "graph")
+    session.checks = True
     if settings.policy is not None:
         session.refuse("USING MATCHES is allowed only in sequences", written.settings[0].span)
     scope = StepScope(session)

@@ -35,10 +35,11 @@ def bind_block(block: s.Block, names: SymbolTable) -> None:
 
     All nodes and edges are bound before any condition. So a condition inside a node can use later nodes.
     """
+    the_ego = names.session.checks and not _asks_for_a_node(block)
     pending: list[tuple[s.NodePattern | s.EdgePattern, str]] = []
     joined: list[tuple[s.EdgePattern, s.NodePattern, s.NodePattern, str]] = []
     for path in block.paths:
-        keys = [_node(node, names) for node in path.nodes]
+        keys = [_node(node, names, the_ego=the_ego) for node in path.nodes]
         pending += zip(path.nodes, keys, strict=True)
         edges = [
             (edge, _edge(edge, left, right, names))
@@ -56,6 +57,12 @@ def bind_block(block: s.Block, names: SymbolTable) -> None:
         _inline(pattern, key, names)
     if block.where is not None:
         names.scope.where += b.conjuncts(names.condition(block.where))
+
+
+def _asks_for_a_node(block: s.Block) -> bool:
+    """True for ``(:Ego)`` alone, whose existence is known in every frame."""
+    (node, *others) = [node for path in block.paths for node in path.nodes]
+    return not (others or node.properties or node.where or block.where)
 
 
 def _block(e: s.BlockExpression, names: SymbolTable) -> b.Bound:
@@ -86,11 +93,16 @@ ALL_BINDERS: Final[Binders] = {
 """Binder of each kind of expression."""
 
 
-def _node(node: s.NodePattern, names: SymbolTable) -> str:
+def _node(node: s.NodePattern, names: SymbolTable, *, the_ego: bool = False) -> str:
+    """Return the key of a pattern node. If ``the_ego``, a new node with the label ``Ego`` is ``ego``."""
     kinds = kinds_of(node.label, names.session) if node.label else b.any_kinds()
     if not kinds:
         names.session.refuse("no node can have this label", node.span)
     key = _known_node(node, names)
+    if key is None and the_ego and not kinds.other:
+        key = names.node(THE_EGO, node.span)
+        if node.name is not None:
+            names.meanings[node.name] = Symbol(node=key)
     if key is None:
         _refuse_bare_label(node, names)
         key = names.scope.add(node.name, kinds, node.span, named=node.name is not None)
@@ -107,7 +119,13 @@ def _node(node: s.NodePattern, names: SymbolTable) -> str:
 
 
 def _refuse_bare_label(node: s.NodePattern, names: SymbolTable) -> None:
-    """Raise an error for ``(Car)``, a node with a label as its name. The user probably means ``(:Car)``."""
+    """Raise an error for ``(Car)`` or ``(EGO)``. The user probably means ``(:Car)`` or ``(ego)``."""
+    if node.name and node.name.lower() == THE_EGO and not node.label:
+        names.session.refuse(
+            f"({node.name}) matches any node and names it {node.name}",
+            node.name_span,
+            "write the ego as (ego), or as a label: (e:Ego)",
+        )
     if node.name and node.name[0].isupper() and not node.label and node.name in labels():
         names.session.refuse(
             f"({node.name}) matches any node and names it {node.name}",

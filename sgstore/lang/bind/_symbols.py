@@ -120,6 +120,8 @@ class Session:
         Notes on parts of the query that never hold, or always.
     shipped : bool
         True in a sequence of the library, whose text is not that of the query.
+    checks : bool
+        True in a ``CHECK``, where a node with the label ``Ego`` in braces is the node ``ego``.
     """
 
     text: str
@@ -151,6 +153,7 @@ class Session:
     strict: bool = True
     doubts: list[str] = field(default_factory=list[str])
     shipped: bool = False
+    checks: bool = False
 
     def ask(self, catalog: Catalog) -> None:
         """Copy the known names (attributes, tables, traces) from the catalog of a store."""
@@ -265,7 +268,7 @@ class ScopeBuilder:
                 self.session.refuse(
                     "two nodes are the ego, but different nodes of a pattern cannot be equal",
                     self.nodes[a].span,
-                    "a frame has one ego: use one variable, or USING NODES any",
+                    "a frame has one ego: write (ego) in both places, or USING NODES any",
                 )
         return frozenset(pairs)
 
