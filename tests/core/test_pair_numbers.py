@@ -29,7 +29,7 @@ from sgstore.model.pair_numbers import (
 from sgstore.model.vocabulary import SIGNALS, VEHICLES
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from sgstore.model.world import Floats
@@ -397,8 +397,9 @@ def test_a_number_is_what_its_definition_says(name: str) -> None:
     assert len(a) > 200
 
 
-@pytest.mark.parametrize("name", [name for name, one in PAIR_FUNCTIONS.items() if one.sql])
-def test_a_number_as_an_array_is_what_the_database_computes(name: str) -> None:
+@pytest.fixture(scope="module")
+def movers() -> Iterator[tuple[Floats, Floats, duckdb.DuckDBPyConnection]]:
+    """Random pairs as arrays, and the same pairs as a table."""
     a, b = random_movers(2000, seed=4)
     rng = np.random.default_rng(4)
     a, b = (np.hstack([side, rng.uniform(-8, 4, (len(side), 2))]) for side in (a, b))
@@ -426,11 +427,17 @@ def test_a_number_as_an_array_is_what_the_database_computes(name: str) -> None:
             " CREATE TABLE inside.state AS"
             f" SELECT frame_id, node_id, kind, FALSE AS is_ego, {read} FROM state"
         )
-        view, _ = pairs_view("criticality")
-        column = PAIR_FUNCTIONS[name].column or name
-        rows = db.execute(
-            f"SELECT {column} FROM ({view}) WHERE src = 0 ORDER BY frame_id"
-        ).fetchall()
+        yield a, b, db
+
+
+@pytest.mark.parametrize("name", [name for name, one in PAIR_FUNCTIONS.items() if one.sql])
+def test_a_number_as_an_array_is_what_the_database_computes(
+    name: str, movers: tuple[Floats, Floats, duckdb.DuckDBPyConnection]
+) -> None:
+    a, b, db = movers
+    view, _ = pairs_view("criticality")
+    column = PAIR_FUNCTIONS[name].column or name
+    rows = db.execute(f"SELECT {column} FROM ({view}) WHERE src = 0 ORDER BY frame_id").fetchall()
 
     wanted = np.array([np.nan if value is None else value for (value,) in rows])
     found = PairNumbers(a, b)[name]
