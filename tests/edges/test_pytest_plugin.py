@@ -85,13 +85,6 @@ def test_ids_are_the_same_in_a_store_that_was_made_again(
     assert ids(here.runpytest(*PLUGIN, "--collect-only", "-q")) == once
 
 
-def test_several_processes_share_the_scenes(here: pytest.Pytester) -> None:
-    here.makepyfile(TEST)
-    alone = here.runpytest(*PLUGIN).parseoutcomes()["passed"]
-
-    here.runpytest(*PLUGIN, "-n2").assert_outcomes(passed=alone)
-
-
 def test_a_scene_hands_out_graphs_payloads_and_time(here: pytest.Pytester) -> None:
     here.makepyfile(
         """
@@ -336,12 +329,15 @@ def test_a_rule_that_a_trace_cannot_answer_is_skipped_and_not_passed(
     rules.runpytest(*PLUGIN).assert_outcomes(passed=1, skipped=1)
 
 
-def test_several_processes_share_the_rules(rules: pytest.Pytester) -> None:
+def test_several_processes_share_the_scenes_and_the_rules(rules: pytest.Pytester) -> None:
+    rules.makepyfile(test_scenes=TEST)
+    scenes = rules.runpytest(*PLUGIN, "test_scenes.py").parseoutcomes()["passed"]
     alone = rules.runpytest(*PLUGIN).parseoutcomes()
 
     there = rules.runpytest(*PLUGIN, "-n2").parseoutcomes()
 
     assert [there[k] for k in ("passed", "failed")] == [alone[k] for k in ("passed", "failed")]
+    assert there["passed"] > scenes > 1
 
 
 def test_a_wrong_mark_hides_no_other_test(here: pytest.Pytester) -> None:
