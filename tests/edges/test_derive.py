@@ -53,7 +53,7 @@ JOIN inside.bits b ON (n.mask & b.m) <> 0 WHERE n.set_name = '{0}'
 """
 
 
-SECONDS = 15.0 if LONG else 11.0
+SECONDS = 15.0 if LONG else 5.0
 """How much of the sample is derived with all settings."""
 
 
@@ -65,7 +65,12 @@ def stored(path: Any, trace: Any, config: Any = None, until: float = 15.0):
 
 @pytest.fixture(scope="module")
 def town(tmp_path_factory: pytest.TempPathFactory):
-    return stored(tmp_path_factory.mktemp("derive") / "town.sgstore", SAMPLE, until=SECONDS)
+    return stored(tmp_path_factory.mktemp("derive") / "town.sgstore", SAMPLE, until=11)
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory):
+    return stored(tmp_path_factory.mktemp("short") / "town.sgstore", SAMPLE, until=SECONDS)
 
 
 def same(derived: Any, name: Any, ingested: Any) -> None:
@@ -83,14 +88,14 @@ def same(derived: Any, name: Any, ingested: Any) -> None:
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_a_derived_set_is_what_ingesting_with_its_settings_gives(
-    town: Any, name: Any, tmp_path: Path
+    short: Any, name: Any, tmp_path: Path
 ) -> None:
-    (result,) = derive(town.file.path, OTHERS[name], name)
+    (result,) = derive(short.file.path, OTHERS[name], name)
     ingested = stored(tmp_path / "other.sgstore", SAMPLE, OTHERS[name], SECONDS)
 
-    assert (result.status, result.frames) == ("derived", town.info()[0].frames)
-    same(town, name, ingested)
-    assert not town.file.verify().faults
+    assert (result.status, result.frames) == ("derived", short.info()[0].frames)
+    same(short, name, ingested)
+    assert not short.file.verify().faults
 
 
 REAL = (
@@ -159,7 +164,7 @@ def test_a_wider_set_is_asked_and_drawn_like_a_store_of_its_range(
 def test_deriving_needs_no_recording_and_goes_on_where_it_was(tmp_path: Path) -> None:
     copy, store = tmp_path / "drive.mcap", tmp_path / "s.sgstore"
     copy.write_bytes(SAMPLE.read_bytes())
-    ingest(store, [str(copy)], until=15.0)
+    ingest(store, [str(copy)], until=3.0)
     copy.unlink()
 
     first = derive(store, OTHERS["smaller"], "mine")
@@ -226,7 +231,7 @@ def test_a_graph_of_a_set_has_its_nodes_and_edges_and_what_is_known_of_them(town
 
 
 def test_a_trace_that_is_removed_takes_its_sets_with_it(tmp_path: Path) -> None:
-    store = stored(tmp_path / "s.sgstore", SAMPLE)
+    store = stored(tmp_path / "s.sgstore", SAMPLE, until=3.0)
     derive(store.file.path, OTHERS["smaller"], "gone")
     store.file.remove("town")
 
