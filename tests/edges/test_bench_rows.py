@@ -19,7 +19,7 @@ from sgstore.lang.library import patterns
 if TYPE_CHECKING:
     from pathlib import Path
 
-pytestmark = pytest.mark.seconds(30)
+pytestmark = pytest.mark.seconds(13)
 
 
 @pytest.fixture(scope="module")

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
     from sgstore.lang.sql import Compiled
 
-pytestmark = [pytest.mark.seconds(25), pytest.mark.usefixtures("own_cache")]
+pytestmark = [pytest.mark.seconds(44), pytest.mark.usefixtures("own_cache")]
 
 TRACES = 5
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from sgstore.query import Store
 
-pytestmark = pytest.mark.seconds(9)
+pytestmark = pytest.mark.seconds(17)
 
 ENTRIES = entries()
 

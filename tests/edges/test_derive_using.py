@@ -16,7 +16,7 @@ from sgstore.model.config import configured
 from sgstore.model.vocabulary import RELATIONS
 from sgstore.pipeline.derive import derive, keep_abstraction
 
-pytestmark = pytest.mark.seconds(14)
+pytestmark = pytest.mark.seconds(6)
 
 SAMPLE = resources.files("sgstore") / "apps" / "sample" / "town.mcap"
 OTHER = configured(

@@ -13,6 +13,7 @@ import pytest
 from drawing import Crossing, crowd, entity, graph_of, related
 from matplotlib.artist import Artist
 from PIL import Image
+from thorough import some
 
 from sgstore.apps.cli import run
 from sgstore.draw import draw_clip, draw_stored
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-pytestmark = pytest.mark.seconds(10)
+pytestmark = pytest.mark.seconds(17)
 
 RED = (
     "MATCH (light:TrafficLight {light_state: 'red'})-[:controlsTrafficOf]->(:Lane)<-[:isIn]-(:Ego)"
@@ -212,8 +213,10 @@ class Set(Artist):
         renderer.draw_image(pen, round(x) + left, round(y) + below, pixels)
 
 
-@pytest.mark.parametrize("relations", ["ego", "all"])
-@pytest.mark.parametrize("diagram", [False, True])
+@pytest.mark.parametrize(
+    ("diagram", "relations"),
+    some([(False, "ego"), (True, "ego"), (False, "all"), (True, "all")], 3),
+)
 def test_a_page_of_a_film_has_the_pixels_of_a_page(relations: Any, diagram: bool) -> None:
     road_map = Crossing()
     film: list[FilmPage] = []

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
     from sgstore.query import Store
 
-pytestmark = pytest.mark.seconds(19)
+pytestmark = pytest.mark.seconds(11)
 
 S = 1_000_000_000
 OURS = {"/sgstore/graph", "/sgstore/scene", "/sgstore/tf", "/sgstore/labels"}

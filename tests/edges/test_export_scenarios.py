@@ -23,7 +23,7 @@ from sgstore.model.world import Clip
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-pytestmark = pytest.mark.seconds(8)
+pytestmark = pytest.mark.seconds(6)
 
 S = 1_000_000_000
 SCHEMA = (

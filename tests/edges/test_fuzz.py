@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-pytestmark = pytest.mark.seconds(27)
+pytestmark = pytest.mark.seconds(57)
 
 CASES = 72 if LONG else 20
 """Cases of each flavour: more than 400 in all, 500 in ``make oracle``, and 100,000 by ``make fuzz``.

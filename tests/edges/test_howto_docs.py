@@ -19,7 +19,7 @@ from sgstore.apps.demo import RECORDING
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-pytestmark = pytest.mark.seconds(30)
+pytestmark = pytest.mark.seconds(17)
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"

@@ -47,7 +47,7 @@ pytest_plugins = ["pytester"]
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-pytestmark = pytest.mark.seconds(8)
+pytestmark = pytest.mark.seconds(12)
 
 SAMPLE = Path(sgstore.__file__).parent / "apps" / "sample" / "town.mcap"
 FRAMES = 61

@@ -17,7 +17,7 @@ from sgstore.query import Store
 if TYPE_CHECKING:
     from pathlib import Path
 
-pytestmark = pytest.mark.seconds(6)
+pytestmark = pytest.mark.seconds(13)
 
 LIBRARY = [p for p in patterns().values() if p.kind in {"concept", "scenario"}]
 STEP = re.compile(

@@ -41,7 +41,7 @@ from sgstore.testsets.selection._near_pairs import worst_in_frames
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-pytestmark = pytest.mark.seconds(13)
+pytestmark = pytest.mark.seconds(32)
 
 OTHERS = """src_is_ego AND dst_kind NOT IN ('traffic_light', 'stop_sign', 'yield_sign', 'speed_limit', 'sign',
   'building', 'pole', 'barrier', 'vegetation')"""

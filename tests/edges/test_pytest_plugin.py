@@ -18,7 +18,7 @@ from sgstore.testsets.locks import lock_of
 if TYPE_CHECKING:
     from pathlib import Path
 
-pytestmark = pytest.mark.seconds(28)
+pytestmark = pytest.mark.seconds(18)
 
 pytest_plugins = ["pytester"]
 

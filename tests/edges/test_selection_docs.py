@@ -14,7 +14,7 @@ import sgstore
 from sgstore.apps.cli import app, run
 from sgstore.ingest import ingest
 
-pytestmark = pytest.mark.seconds(11)
+pytestmark = pytest.mark.seconds(8)
 
 PAGE = (Path(__file__).parents[2] / "docs" / "selection.md").read_text(encoding="utf-8")
 COMMANDS = [

@@ -36,7 +36,7 @@ from sgstore.store import StateColumns
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-pytestmark = pytest.mark.seconds(14)
+pytestmark = pytest.mark.seconds(45)
 
 HOST = "127.0.0.1:8123"
 TOKEN = "a-token-of-the-tests"

@@ -18,7 +18,7 @@ from sgstore.ingest import ingest
 from sgstore.pipeline.rebuild import rebuild
 from sgstore.store import BundleSource, Sealed, verify_file
 
-pytestmark = [pytest.mark.seconds(6), pytest.mark.usefixtures("own_cache")]
+pytestmark = [pytest.mark.seconds(13), pytest.mark.usefixtures("own_cache")]
 
 TOPICS = ("/imu", "/planner")
 
