@@ -9,16 +9,19 @@ import mutants
 import mutants_coverage
 import mutants_server
 import pytest
+from thorough import some
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-pytestmark = pytest.mark.seconds(16)
+pytestmark = pytest.mark.seconds(7)
 
 ROOMS = list(mutants.ROOMS)
+TRIED = some(ROOMS, 3)
+"""``make oracle`` tries every room."""
 
 
-@pytest.mark.parametrize("room", ROOMS)
+@pytest.mark.parametrize("room", TRIED)
 def test_a_room_has_mutants_of_every_kind_the_same_for_the_same_seed(room: str) -> None:
     found = mutants.chosen(room, 14, seed=14)
 
@@ -42,7 +45,7 @@ def test_who_changes_a_file_gets_the_same_mutants_in_others(
     assert {m for m in before if m.path != changed} <= {*after}
 
 
-@pytest.mark.parametrize("room", ROOMS)
+@pytest.mark.parametrize("room", TRIED)
 def test_a_mutant_is_python_that_differs_in_one_place(room: str) -> None:
     for mutant in mutants.chosen(room, 25, seed=3):
         assert ast.dump(ast.parse(mutant.old)) != ast.dump(ast.parse(mutant.new)), mutant.key
@@ -58,7 +61,7 @@ def test_a_room_has_its_tests(room: str) -> None:
     assert len(mutants.files_of(room)) >= 3
 
 
-@pytest.mark.parametrize("room", ROOMS)
+@pytest.mark.parametrize("room", TRIED)
 def test_no_two_mutants_are_known_by_one_name(room: str) -> None:
     for path in (mutants.REPOSITORY / "sgstore" / room).rglob("*.py"):
         made = mutants.mutants_of(path)
@@ -66,12 +69,13 @@ def test_no_two_mutants_are_known_by_one_name(room: str) -> None:
 
 
 def test_mutants_that_are_listed_as_equivalent_can_be_made_and_have_a_reason() -> None:
-    rooms = [mutants.REPOSITORY / "sgstore" / room for room in ROOMS]
-    known = {
-        m.key for room in rooms for path in room.rglob("*.py") for m in mutants.mutants_of(path)
-    }
+    listed = mutants.equivalent().keys()
+    files = {mutants.REPOSITORY / key.split()[0] for key in listed}
+    known = {mutant.key for path in files for mutant in mutants.mutants_of(path)}
 
-    assert mutants.equivalent().keys() <= known
+    assert listed <= known
+    rooms = [mutants.REPOSITORY / "sgstore" / room for room in ROOMS]
+    assert all(any(path.is_relative_to(room) for room in rooms) for path in files)
 
 
 def test_a_test_finds_a_mutant_or_passes(
