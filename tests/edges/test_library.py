@@ -14,7 +14,7 @@ from library_scenes import SCENES, is_of_the_ego, traces
 from scenes import APART, store_of
 from test_sample import told
 from test_temporal import FORMULAS, FORMULAS_OF_TIME, never, property_named
-from thorough import LONG
+from thorough import LONG, some
 
 from sgstore.errors import QueryError, QueryNameError
 from sgstore.lang.library import entries, pattern_named, patterns, predicates
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from sgstore.query import Store
     from sgstore.temporal import Formula, Verdict
 
-pytestmark = pytest.mark.seconds(20)
+pytestmark = pytest.mark.seconds(42)
 
 FOUND = [name for name, one in patterns().items() if one.kind in {"concept", "scenario"}]
 RULES = [name for name, one in patterns().items() if one.kind == "property"]
@@ -272,7 +272,9 @@ def test_a_rule_is_violated_in_its_example_and_kept_in_the_other(store: Store, n
     assert answered(verdicts["town"])
 
 
-@pytest.mark.parametrize("name", [n for n in (*FOUND, *RULES) if patterns()[n].library == "rules"])
+@pytest.mark.parametrize(
+    "name", some([n for n in (*FOUND, *RULES) if patterns()[n].library == "rules"], 2)
+)
 def test_a_rule_watched_is_violated_and_kept_in_the_same_scenes(store: Store, name: str) -> None:
     for (trace, number), violated in zip(PLACES[name], (True, False), strict=True):
         span = number * APART, (number + 1) * APART
