@@ -20,6 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from recordings import drive
+from thorough import share_of
 
 import sgstore.mcap._chunks as chunks
 import sgstore.mcap._read_ahead as ahead
@@ -308,7 +309,7 @@ def test_a_message_stays_what_it_is_as_long_as_somebody_holds_it(tmp_path: Path)
 
 
 @given(st.lists(st.tuples(st.integers(0, 3 << 20), st.integers(0, 5)), max_size=30))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=share_of(60), deadline=None)
 def test_memory_is_never_handed_out_while_somebody_looks_at_it(
     wishes: list[tuple[int, int]],
 ) -> None:

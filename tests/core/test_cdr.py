@@ -14,6 +14,7 @@ from carla_recordings import definition, header, thing
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
+from thorough import share_of
 
 from sgstore.errors import TraceError
 from sgstore.readers import decode, parse_definition
@@ -117,7 +118,7 @@ def examples(draw: st.DrawFn) -> tuple[str, dict[str, Any]]:
     return written("Top") + rest, top
 
 
-@settings(max_examples=120, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=share_of(120), deadline=None, suppress_health_check=list(HealthCheck))
 @given(examples())
 def test_any_message_is_decoded_as_it_was_meant(case: tuple[str, dict[str, Any]]) -> None:
     content, message = case
@@ -129,7 +130,7 @@ def test_any_message_is_decoded_as_it_was_meant(case: tuple[str, dict[str, Any]]
     assert found == plain(generate_dynamic("pkg/msg/Top", content)["pkg/msg/Top"](data))
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=share_of(60), deadline=None, suppress_health_check=list(HealthCheck))
 @given(examples())
 def test_fields_are_those_of_the_whole_message(case: tuple[str, dict[str, Any]]) -> None:
     content, message = case
@@ -157,7 +158,7 @@ def test_fields_are_those_of_the_whole_message(case: tuple[str, dict[str, Any]])
             reader.read(data[:length])
 
 
-@settings(max_examples=80, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=share_of(80), deadline=None, suppress_health_check=list(HealthCheck))
 @given(examples(), st.floats(0, 1), st.integers(0, (1 << 32) - 1))
 def test_any_message_that_is_cut_or_spoiled_ends_in_a_message_or_an_error(
     case: tuple[str, dict[str, Any]], where: float, value: int
@@ -247,7 +248,7 @@ things = st.builds(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=share_of(60), deadline=None)
 @given(st.lists(st.lists(things, max_size=12), min_size=1, max_size=4))
 @example([[thing(1), thing(2, frame="some/other"), thing(3)]])
 def test_a_table_is_what_decoding_one_by_one_gives(messages: list[list[dict[str, Any]]]) -> None:

@@ -16,6 +16,7 @@ from foxglove_scenes import SceneRecorder, cube, turn
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from recordings import ns
+from thorough import share_of
 
 from sgstore.errors import TraceError
 from sgstore.model.vocabulary import KINDS, LIGHT_STATES
@@ -473,7 +474,7 @@ def matrix(q: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     ).T
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=share_of(60), deadline=None)
 @given(turns, turns, places)
 @example(normed(np.array([1.0, 0.0, 1.0, 0.0])), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
 @example(normed(np.array([0.3, -0.7, -0.3, -0.7])), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))

@@ -12,6 +12,7 @@ import pytest
 from graph_blocks import RandomTrace
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from thorough import share_of
 
 from sgstore.ingest import ingest
 from sgstore.maps.opendrive import read_map
@@ -191,7 +192,7 @@ NEAR = st.one_of(
 
 
 @given(st.lists(NEAR, min_size=1, max_size=20), FAR_ORIGINS)
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=share_of(200), deadline=None)
 def test_what_is_kept_is_what_comes_back(offsets: Any, zero: Any) -> None:
     block = RandomTrace(frames=1).blocks[0].frames
     x = zero + np.array(offsets)

@@ -19,7 +19,7 @@ from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, Header, Message, Schema
 from mcap.stream_reader import StreamReader
 from recordings import OSI, Recorder, bulb, car, drive, ground_truth, house, person, sign
-from thorough import LONG, some
+from thorough import share_of, some
 
 import sgstore.mcap._reader as mcap_reader
 from sgstore.errors import TraceError
@@ -659,7 +659,7 @@ def seeds(tmp_path_factory: pytest.TempPathFactory) -> list[bytes]:
     ]
 
 
-@settings(max_examples=250 if LONG else 80, deadline=5000, suppress_health_check=list(HealthCheck))
+@settings(max_examples=share_of(250), deadline=5000, suppress_health_check=list(HealthCheck))
 @given(seed=st.integers(0, 4), changes=mutations)
 @example(seed=2, changes=[("set", 0.5, 0, 1)])
 def test_whatever_is_done_to_a_recording_it_ends_in_frames_or_an_error(
@@ -671,7 +671,7 @@ def test_whatever_is_done_to_a_recording_it_ends_in_frames_or_an_error(
     assert survived(path)
 
 
-@settings(max_examples=150 if LONG else 60, deadline=5000, suppress_health_check=list(HealthCheck))
+@settings(max_examples=share_of(150), deadline=5000, suppress_health_check=list(HealthCheck))
 @given(changes=mutations)
 def test_whatever_is_done_to_the_descriptors_it_ends_in_frames_or_an_error(
     tmp_path: Path, changes: list[tuple[str, float, int, int]]
@@ -689,7 +689,7 @@ def test_whatever_is_done_to_the_descriptors_it_ends_in_frames_or_an_error(
     assert survived(path)
 
 
-@settings(max_examples=200 if LONG else 70, deadline=5000, suppress_health_check=list(HealthCheck))
+@settings(max_examples=share_of(200), deadline=5000, suppress_health_check=list(HealthCheck))
 @given(changes=mutations, which=st.integers(0, 3))
 def test_whatever_is_done_to_the_messages_it_ends_in_frames_or_an_error(
     tmp_path: Path, changes: list[tuple[str, float, int, int]], which: int

@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.records import Schema
 from recordings import OSI, Osi, Recorder, bulb, car, drive, ground_truth, house, ns, person, sign
+from thorough import share_of
 
 import sgstore
 import sgstore.readers._blocks as frames
@@ -552,13 +553,13 @@ def assert_read_as_attributes(contents: list[bytes]) -> None:
             assert values[row, place] == pytest.approx(expected, nan_ok=True, abs=0, rel=0)
 
 
-@settings(max_examples=80, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=share_of(80), deadline=None, suppress_health_check=list(HealthCheck))
 @given(st.lists(moving_objects(), max_size=12))
 def test_objects_read_in_bulk_are_what_their_attributes_say(things: list[Any]) -> None:
     assert_read_as_attributes([thing.SerializeToString() for thing in things])
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=share_of(60), deadline=None, suppress_health_check=list(HealthCheck))
 @given(st.lists(moving_objects(), min_size=1, max_size=5), st.data())
 def test_objects_that_are_hurt_or_oddly_written_are_what_protobuf_says(
     things: list[Any], draw: Any
@@ -594,7 +595,7 @@ def test_layouts_without_end_are_read_all_the_same() -> None:
     assert_read_as_attributes(things + odd)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=share_of(60), deadline=None)
 @given(
     st.lists(st.sets(st.integers(0, 4)), min_size=1, max_size=7),
     st.lists(st.integers(-1, 3), min_size=7, max_size=7),

@@ -12,6 +12,7 @@ import shapely
 from builders import PaperMap, Patch, Place, Recording, Thing, edges, frames, graph_of, thing
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from thorough import share_of
 
 from sgstore.graphs.relations import BlockScene, Relation, as_markdown, relations, relations_under
 from sgstore.model.config import Config, Direction, PairSettings, Proximity, RangeSettings
@@ -565,7 +566,7 @@ def touched_by(t: Thing, *kinds: str) -> list[Patch]:
 
 @given(st.integers(0, 2**32), st.integers(2, 25), st.sampled_from([8, 30, 70]))
 @example(410388, 5, 70)  # a lane out of range in which a body in range stands
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=share_of(60), deadline=None)
 def test_relations_equal_their_definition_on_random_scenes(
     seed: int, count: int, size: float
 ) -> None:
@@ -588,7 +589,7 @@ on_a_grid = st.builds(
 
 
 @given(st.lists(on_a_grid, max_size=8))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=share_of(100), deadline=None)
 def test_relations_equal_their_definition_where_everything_lies_on_bounds(
     others: list[Thing],
 ) -> None:

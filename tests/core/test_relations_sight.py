@@ -12,6 +12,7 @@ from builders import Place, Recording, Thing, edges, frames, graph_of, thing
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_relations import storeys_apart
+from thorough import share_of
 
 from sgstore.model.config import Config, RangeSettings
 from sgstore.model.vocabulary import SIGNALS
@@ -205,7 +206,7 @@ def crowd(seed: int, count: int, size: float) -> list[Thing]:
 
 
 @given(st.integers(0, 2**32), st.integers(1, 14), st.sampled_from([6, 15, 40]))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=share_of(150), deadline=None)
 def test_what_is_seen_is_what_a_free_line_leads_to(seed: int, count: int, size: float) -> None:
     things = crowd(seed, count, size)
 

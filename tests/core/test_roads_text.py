@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from opendrive_maps import a_map, a_road, line
+from thorough import share_of
 
 from sgstore.errors import MapError
 from sgstore.maps.opendrive import parse_map, read_map
@@ -69,7 +70,7 @@ coordinates = st.floats(-1e6, 1e6)
     name=st.text(max_size=20),
     onto=st.lists(st.integers(0, 1), max_size=3),
 )
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=share_of(50), deadline=None)
 def test_what_is_read_back_from_a_text_is_what_was_there_to_the_last_bit(
     corners: list[tuple[float, ...]], name: str, onto: list[int]
 ) -> None:

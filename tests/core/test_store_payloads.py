@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from recordings import Recorder, car, drive
+from thorough import share_of
 
 import sgstore.store._payloads as payloads
 from sgstore.errors import StoreError, TraceError
@@ -133,7 +134,7 @@ class Frames:
         self.seq, self.time_ns, self.log_time_ns, self.events = seq, time_ns, time_ns, events
 
 
-@settings(max_examples=200)
+@settings(max_examples=share_of(200))
 @given(
     steps=st.lists(st.integers(1, 50), min_size=1, max_size=30),
     places=st.lists(st.integers(-100, 1500), max_size=20),

@@ -25,3 +25,8 @@ def some(cases: Sequence[T], one_in: int) -> Sequence[T]:
         cuts of files, whose records begin with 9 bytes.
     """
     return cases if LONG else [*cases[:-1:one_in], cases[-1]]
+
+
+def share_of(many: int) -> int:
+    """Number of examples of a property test: all in a long run, else a third."""
+    return many if LONG else many // 3
