@@ -39,7 +39,7 @@ SHARED = [
     for path in sorted((DATA / part).rglob("*.mcap"))
     if "damaged" not in path.parts
 ]
-COUNT = int(os.environ.get("SGSTORE_PERMUTATIONS", "200" if LONG else "2"))
+COUNT = int(os.environ.get("SGSTORE_PERMUTATIONS", "200" if LONG else "1"))
 
 
 def rich_osi(path: Path) -> Path:
@@ -156,8 +156,15 @@ def test_messages_of_a_bag_may_lie_in_any_of_its_files(name: str, tmp_path: Path
         assert not first_difference(rows, found)
 
 
-@pytest.mark.parametrize("rebased", [False, True])
-@pytest.mark.parametrize("name", MANY)
+@pytest.mark.parametrize(
+    ("name", "rebased"),
+    [
+        (name, rebased)
+        for number, name in enumerate(MANY)
+        for rebased in (False, True)
+        if LONG or rebased == number % 2
+    ],
+)
 def test_clips_of_any_order_are_one_clip(name: str, rebased: bool, tmp_path: Path) -> None:
     path = MANY[name](tmp_path / f"{name}.mcap")
     times = [message.log_time / 1e9 for message in Recorded.of(path).messages]
@@ -300,7 +307,7 @@ def test_a_topic_may_be_split_over_two_channels(name: str, tmp_path: Path) -> No
     rows = [row for row in block_rows(path) if row[0] in told]
     found: list[Any] = []
 
-    for number in range(COUNT):
+    for number in range(max(COUNT, 2)):
         draw = random.Random(number)
         file = split.permuted(draw).write(tmp_path / str(number) / path.name, draw)
         found.append(block_rows(file))
