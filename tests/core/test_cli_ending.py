@@ -88,6 +88,8 @@ ENDLESS = {
     "shrink": ["{store}", RULE, "--to", "{new}/cut"],
 }
 """Questions that take longer than the deadline, however fast the machine is."""
+LATE = thorough.some([*ENDLESS], 2)
+"""The verbs that end at a deadline; ``make oracle`` tries all of them."""
 
 
 @pytest.fixture(scope="module")
@@ -96,9 +98,10 @@ def late(town_store: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str
 
     Each runs in a process of its own, forked from one that imported all: what comes too late ends that one.
     """
-    folders = {verb: tmp_path_factory.mktemp(verb.replace(" ", "-")) for verb in ENDLESS}
+    folders = {verb: tmp_path_factory.mktemp(verb.replace(" ", "-")) for verb in LATE}
     asked = []
-    for verb, line in ENDLESS.items():
+    for verb in LATE:
+        line = ENDLESS[verb]
         names = {"store": town_store, "new": folders[verb] / "new"}
         words = [*verb.split(), *(part.format(**names) for part in line), "--timeout", "200ms"]
         asked.append([(words, "")])
@@ -111,10 +114,10 @@ def late(town_store: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str
         timeout=600,
     )
     ends = map(json.loads, done.stdout.splitlines())
-    return {verb: (*end, folders[verb]) for verb, end in zip(ENDLESS, ends, strict=True)}
+    return {verb: (*end, folders[verb]) for verb, end in zip(LATE, ends, strict=True)}
 
 
-@pytest.mark.parametrize("verb", ENDLESS)
+@pytest.mark.parametrize("verb", LATE)
 def test_a_question_ends_at_its_deadline_and_leaves_nothing(
     verb: str, late: dict[str, Any]
 ) -> None:
@@ -344,7 +347,7 @@ def test_verbs_that_ask_a_store_say_in_the_same_words_how_they_are_bounded() -> 
         assert len(set(map(str, having.values()))) == 1
 
 
-@pytest.mark.parametrize("verb", thorough.some(ASKING, 3))
+@pytest.mark.parametrize("verb", thorough.some(ASKING, 5))
 def test_every_verb_that_asks_heeds_its_bounds_and_leaves_nothing_where_time_is_over(
     verb: str,
     files: dict[str, str],
@@ -604,7 +607,7 @@ def test_a_refused_export_removes_the_folders_of_a_killed_one(
     to, temporary = tmp_path / "to", tmp_path / "tmp"
     temporary.mkdir()
     more = ["--as", "parquet"] if verb == "export" else []
-    line = [verb, str(town_store), "MATCH (e:Ego) WHERE e.speed > 9", "--to", str(to), *more]
+    line = [verb, str(town_store), "MATCH (e:Ego) WHERE frame.seq < 5", "--to", str(to), *more]
     code = (
         "import os, signal, sys; from sgstore.apps import cli; "
         "from sgstore.base import temporary_folders as files; "

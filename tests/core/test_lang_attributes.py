@@ -261,7 +261,7 @@ def test_attribute_in_every_form(
         assert rows == kept, condition
 
 
-@pytest.mark.parametrize(("name", "attribute", "pattern"), some(asked_of(), 2))
+@pytest.mark.parametrize(("name", "attribute", "pattern"), some(asked_of(), 4))
 def test_attribute_in_returned_values(
     name: str, attribute: Attribute, pattern: str, store: Store, found: Found
 ) -> None:

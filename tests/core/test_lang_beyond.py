@@ -17,7 +17,7 @@ from sgstore.model.config import Config, PairSettings, Proximity, RangeSettings
 from sgstore.temporal import Monitor
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from sgstore.query import Store
@@ -201,6 +201,18 @@ PEOPLE: Final = Scene(
 )
 
 
+@pytest.fixture(scope="module")
+def excluding(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Config], Store]:
+    """A store of these people for each configuration."""
+
+    @cache
+    def stored_with(config: Config) -> Store:
+        folder = tmp_path_factory.mktemp("people")
+        return store_of(folder / "s.sgstore", {"road": [PEOPLE]}, {"road": config})
+
+    return stored_with
+
+
 @pytest.mark.parametrize(
     ("check", "expected"),
     [
@@ -221,9 +233,9 @@ PEOPLE: Final = Scene(
     "config", [Config(kinds=("Vehicle", "Lane", "Road")), Config(exclude_ids=("p",))]
 )
 def test_check_of_excluded_entities_is_unknown(
-    tmp_path: Path, check: str, expected: str, config: Config
+    excluding: Callable[[Config], Store], check: str, expected: str, config: Config
 ) -> None:
-    store = store_of(tmp_path / "s.sgstore", {"road": [PEOPLE]}, {"road": config})
+    store = excluding(config)
     text = f"CHECK c: {check}"
     monitor = Monitor(text, PEOPLE.road, config)
     for frame in replayed([PEOPLE.block()]):
