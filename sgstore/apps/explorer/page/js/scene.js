@@ -10,6 +10,7 @@ import { arrived, failureOf, kindOf, lightOf, nameOf, pictureAt, placeOf, second
 import { egoRow, fitted, legendOf, lookAt, nodeAt, paintScene, rowOf } from "./draw.js";
 import { hop, Neighbours } from "./neighbours.js";
 import { PatternDrawing } from "./pattern.js";
+import { linesOf } from "./relations.js";
 import { ask, chosen, find, inOther, lit, live, offline, open, openFrame, paints, playing, rate, reasonOf, say,
   store, text, traces } from "./state.js";
 import { Timeline } from "./timeline.js";
@@ -275,6 +276,11 @@ function lights(nodes) {
 const NodeButton = ({ node, name }) => (node < 0 ? name : html`<button class="quiet small"
   onClick=${() => choose(node)}>${name}</button>`);
 
+/** The nodes at one end of a line; several open to their names. @param {import("./relations.js").End} props */
+const NodesCell = ({ name, ids }) => (ids.length < 2 ? html`<${NodeButton} node=${ids[0] || 0} name=${name} />`
+  : html`<details><summary>${ids.length} × ${name}</summary>${ids.map((node) => html`<${NodeButton} node=${node}
+    name=${nameOf(open.value?.trace || "", node)} />`)}</details>`);
+
 /** @param {{what: string}} props */
 function GraphTable({ what }) {
   const [graph, setGraph] = useState(/** @type {any} */ (null));
@@ -297,14 +303,15 @@ function GraphTable({ what }) {
     states=${now ? statesAt(now.trace, frame.value) : null} north=${zoom.value.north} />`;
   const bound = new Set(Object.values(now?.binding || {}));
   if (what === "edges") {
-    const names = new Map(graph.nodes.map((/** @type {any} */ n) => [n.id, n.name || n.id]));
     const some = graph.edges.filter((/** @type {any} */ e) => !bound.size || bound.has(e.src) || bound.has(e.dst));
+    const lines = linesOf(some, graph.nodes, bound);
     return html`<div class="scroll" tabindex="0"><table><thead><tr><th>from</th><th>relation</th><th>to</th></tr>
       </thead><tbody>
-      ${some.slice(0, 600).map((/** @type {any} */ e) => html`<tr ...${lights([e.src, e.dst])}>
-        <td><${NodeButton} node=${e.src} name=${names.get(e.src)} /></td><td>${e.relation}</td><td>
-          <${NodeButton} node=${e.dst} name=${names.get(e.dst)} /></td></tr>`)}</tbody></table>
-      ${some.length > 600 ? html`<p class="faint">600 of ${some.length} edges</p>` : null}</div>`;
+      ${lines.slice(0, 600).map(({ src, relation, dst, count }) => html`<tr ...${lights([...src.ids, ...dst.ids])}>
+        <td><${NodesCell} ...${src} /></td><td>${relation}${count > Math.max(src.ids.length,
+          dst.ids.length) ? ` ×${count}` : null}</td>
+        <td><${NodesCell} ...${dst} /></td></tr>`)}</tbody></table>
+      ${lines.length > 600 ? html`<p class="faint">600 of ${lines.length} lines</p>` : null}</div>`;
   }
   const listed = graph.nodes.filter((/** @type {any} */ n) => n.id >= 0).sort((/** @type {any} */ a,
     /** @type {any} */ b) => Number(bound.has(b.id)) - Number(bound.has(a.id)));
