@@ -69,3 +69,37 @@ def faults(page: Any) -> list[str]:
         if one["impact"] in {"serious", "critical"}
         for node in one["nodes"]
     ]
+
+
+JOINED: Final = r"""() => {
+  const ends = /[\p{L}\p{N}.,:;!?)]$/u, begins = /^[\p{L}\p{N}]/u, number = /(?:^|\s)[\d.,]*\d\p{L}{4,}/u;
+  const boxed = one => !/^(?:inline|contents)$/.test(getComputedStyle(one).display);
+  const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT), found = [];
+  const parents = node => { const all = []; for (let at = node.parentElement; at; at = at.parentElement) all.push(at);
+    return all; };
+  const rectOf = (node, from, to) => {
+    const range = document.createRange();
+    range.setStart(node, from);
+    range.setEnd(node, to);
+    return range.getBoundingClientRect();
+  };
+  let before = null;
+  for (let node = walker.nextNode(); node; node = walker.nextNode()) {
+    const text = node.data, one = node.parentElement;
+    if (one.closest(".cm-editor, pre, code, script, style, noscript, title, option, [hidden]")) { before = null; continue; }
+    if (!text) continue;
+    if (number.test(text)) found.push(text);
+    if (before && ends.test(before.data) && begins.test(text)) {
+      const mine = parents(node), others = parents(before);
+      const between = [...mine, ...others].filter(p => !(mine.includes(p) && others.includes(p)));
+      const a = rectOf(before, before.length - 1, before.length), b = rectOf(node, 0, 1);
+      const line = Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top) > Math.min(a.height, b.height) / 2;
+      if (between.some(boxed) ? line && b.left > a.left && b.left - a.right < 2 : a.width && b.width) {
+        found.push(`${before.data.slice(-30)}|${text.slice(0, 30)}`);
+      }
+    }
+    before = node;
+  }
+  return found;
+}"""
+"""Texts in sight that touch the text before them: words without a blank between, or a number with a word."""

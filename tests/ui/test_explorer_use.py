@@ -6,7 +6,7 @@ import re
 from typing import TYPE_CHECKING, Any, Final
 
 import pytest
-from explorer_page import AXE, NEAR, expect, faults, open_first, search
+from explorer_page import AXE, JOINED, NEAR, expect, faults, open_first, search
 
 from sgstore.apps.report import report
 from sgstore.query import Store
@@ -133,6 +133,48 @@ def test_no_view_has_a_serious_fault_of_accessibility(page: Any) -> None:
         page.get_by_role("button", name=tab).click()
         page.locator(sign).wait_for()
         assert faults(page) == []
+
+
+def test_no_view_joins_words(page: Any) -> None:
+    def look() -> None:
+        assert page.evaluate(JOINED) == []
+
+    page.locator(".card").first.wait_for()
+    look()
+    page.evaluate("document.querySelector('.card p').append('11', 'matches')")
+    assert page.evaluate(JOINED) != []
+    page.reload()
+    for query in ("MATCH (e:Ego)-[:near_kol]->(v)", "SELECT trace, frames FROM traces"):
+        search(page, query)
+        look()
+    search(page, "CHECK slow: ALWAYS ego.speed < 3")
+    page.locator(".tile").first.wait_for()
+    look()
+    search(page, f"{NEAR} WHERE e.speed > 3")
+    page.locator(".tile input").first.check()
+    open_first(page)
+    page.get_by_role("button", name="Why?").click()
+    page.locator(".gap").wait_for()
+    look()
+    for tab in ("neighbours", "edges", "nodes"):
+        page.get_by_role("tab", name=tab).click()
+        page.locator(".pattern .scroll").wait_for()
+        look()
+    page.locator(".pattern tbody button").first.click()
+    page.locator(".tall").wait_for()
+    page.keyboard.press("t")
+    page.locator("dialog[open] form").wait_for()
+    look()
+    page.keyboard.press("Escape")
+    page.get_by_role("button", name="Selection").click()
+    page.locator(".clip button").first.wait_for()
+    look()
+    page.get_by_role("button", name="remove all").click()
+    look()
+    for view, sign in {"Compare": ".compare", "Coverage": ".classes .card"}.items():
+        page.get_by_role("button", name=view, exact=True).click()
+        page.locator(sign).first.wait_for()
+        look()
 
 
 def test_page_without_scripts_has_a_message(

@@ -180,8 +180,8 @@ function Nearest({ query }) {
   if (!told.failed) return html`<p class="nearest" role="status">Each part of the pattern is true in some frame,
     but never in this order or for this long.</p>`;
   const go = () => { openFrame(told.trace, told.seq); askWhy(); };
-  const others = (told.others || []).map((/** @type {string} */ one, /** @type {number} */ i) => html`${i ? " and " : ""}
-    <code>${one}</code>`);
+  const others = (told.others || []).map((/** @type {string} */ one,
+    /** @type {number} */ i) => html`${i ? " and " : ""}<code>${one}</code>`);
   return html`<p class="nearest" role="status">No frame of the store has <code>${told.failed}</code>${others.length
     ? html` together with ${others}` : null}. ${told.trace === undefined ? null : html`${told.found
       ? html`The nearest is <code>${told.found}</code>` : "A frame with the other parts"}:
@@ -214,7 +214,7 @@ function Notices() {
     ${notice.value ? html`<p class="notice" role="alert">${notice.value} <button class="small"
       onClick=${close}>Close</button></p>` : null}
     ${changed.value ? html`<p class="notice" role="status">The store has changed since this was asked.
-      <button class="small" onClick=${askAgain}>Ask again</button></p>` : null}`;
+      ${" "}<button class="small" onClick=${askAgain}>Ask again</button></p>` : null}`;
 }
 
 const LOOK = 2000; // ms between looks at the store

@@ -359,7 +359,7 @@ function Transport() {
     ${live.value ? null : html`<button aria-label="Close" title="close (Esc)"
       onClick=${() => { playing.value = false; open.value = null; }}>×</button>`}
     ${told ? html`<span class="gap" role="status">${gap?.failed
-      ? html`<span>${failing > 0 ? `step ${failing > 1 ? `1 to ${failing}` : "1"} of ${of} holds · ` : null}
+      ? html`<span>${failing > 0 ? `step ${failing > 1 ? `1 to ${failing}` : "1"} of ${of} holds ·` : null}${" "}
         <b>${failing >= 0 ? `step ${failing + 1} of ${of} ` : null}fails</b> <code>${gap.failed}</code>
         ${gap.found ? html` · found <code>${gap.found}</code>` : null}</span>`
       : told.error ? told.error.reason : "all of it holds in this frame"}

@@ -99,8 +99,8 @@ function Keep() {
 export function Selection() {
   const all = [...ticked.value.values()], told = useWork("api/select", { clips: clips.value });
   if (!all.length) {
-    return html`<div class="sheet"><h2>Nothing is selected</h2><p class="faint">Tick matches in the gallery, or press
-      <kbd>x</kbd> in a scene. They become a test set here: a lock, or clips of the recordings.</p></div>`;
+    return html`<div class="sheet"><h2>Nothing is selected</h2><p class="faint">Tick matches in the gallery, or
+      press <kbd>x</kbd> in a scene. They become a test set here: a lock, or clips of the recordings.</p></div>`;
   }
   return html`<div class="sheet" tabindex="0">
     <h2>${all.length.toLocaleString("en")} ${all.length === 1 ? "clip" : "clips"}</h2>

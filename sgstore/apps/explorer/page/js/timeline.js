@@ -139,7 +139,7 @@ function Series({ attribute, curves }) {
   const digits = Math.abs(high - low) < 5 ? 2 : 1;
   return html`<div class="lane tall"><div class="label">${drawn.map(({ label, now }, k) => html`<div title=${label}>
     <i style=${{ background: CURVES[k % 6] }}></i>
-        <b>${Number.isFinite(now) ? `${now.toFixed(2)} ${unit}` : "–"}</b> ${label}
+        <b>${Number.isFinite(now) ? `${now.toFixed(2)} ${unit}` : "–"}</b> ${label}${" "}
         <button class="quiet small" aria-label=${`Remove ${label}`}
           onClick=${() => { series.value = series.value.filter((one) => one.label !== label); }}>×</button></div>`)}
       <label>limit <input size="5" inputmode="decimal" aria-label=${`Limit of ${attribute}`}
@@ -219,6 +219,7 @@ export function Timeline() {
   const [from, to] = shown.value, frames = to - from + 1, mine = matches.value.filter((m) => m.trace === now.trace);
   const tags = runsOfTags(notes.value, now.trace), holds = holdsAt(frame.value),
     word = live.value ? "event" : answer.value.verdicts ? "violation" : "match";
+  const words = mine.length === 1 ? word : word === "match" ? "matches" : `${word}s`;
   const all = lanes.value?.lanes || [], steps = new Set(all.map((/** @type {any} */ l) => l.step)).size > 1;
   const first = [...mine].sort((a, b) => Number(a.index === now.match?.index) - Number(b.index === now.match?.index));
   const [begun, end] = arrived.value >= 0 ? [timeAt(now.trace, from), timeAt(now.trace, to)] : [0, 0];
@@ -226,8 +227,7 @@ export function Timeline() {
   const low = Math.ceil(begun / every - 1e-6), many = Math.max(Math.floor(end / every + 1e-6) - low + 1, 0) || 0;
   const ticks = [...Array(many).keys()].map((i) => (low + i) * every);
   return html`<div class="timeline" role="group" aria-label="Timeline" tabindex="0">
-    <div class="lane"><div class="label">${mine.length} ${word}${mine.length === 1 ? "" : word === "match" ? "es"
-      : "s"} <span class="faint">in this trace</span></div>
+    <div class="lane"><div class="label">${mine.length} ${words} <span class="faint">in this trace</span></div>
       <${Bars} spans=${first.map((m) => [m.first, m.last])}
         kind=${(/** @type {number} */ i) => (first[i] && now.match && keyOf(first[i]) === keyOf(now.match)
           ? "bar-match" : "bar-match other")} /></div>
