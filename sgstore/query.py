@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
     from sgstore.lang.catalog import Catalog
-    from sgstore.lang.help import WhyNot, WhyNotSteps
+    from sgstore.lang.help import ConditionValues, WhyNot, WhyNotSteps
     from sgstore.lang.ir import Query
     from sgstore.lang.memory import FrameView
     from sgstore.lang.sql import UnionParts
@@ -1612,6 +1612,56 @@ class Store(StoreVerbs):
             if binding is None and not matches.bindings(ref):
                 binding = self._nearest(ref, text, parameters)
             return matches.parts(ref, binding)
+
+    def condition_values(
+        self,
+        text: str,
+        frame: int | str | FrameRef,
+        binding: Mapping[str, int],
+        /,
+        **parameters: object,
+    ) -> ConditionValues:
+        """Return the values in the conditions of a pattern in a frame, whether the conditions hold or not.
+
+        Parameters
+        ----------
+        text : str
+            Pattern, as for :meth:`find`.
+        frame : int, str or FrameRef
+            Frame, as for :meth:`graph`.
+        binding : mapping of str to int
+            Node ids of variables. For other variables, the nodes that match or come nearest.
+        **parameters
+            Values of ``$name``.
+
+        Returns
+        -------
+        tuple
+            For each lane of :meth:`parts` with the same binding, and each of its conditions: the values with
+            ``name``, ``value`` and ``unit``. Truth values are left out.
+
+        Raises
+        ------
+        QueryError
+            The text is not a query, or lacks a variable of the binding.
+        StoreError
+            The frame does not exist.
+
+        Examples
+        --------
+        >>> text = "MATCH (e:Ego)-[:near_coll]->(v:Vehicle) WHERE e.speed < 5"
+        >>> for lane in store.condition_values(text, "town#204", {"e": 0, "v": 3}):
+        ...     print([f"{one.name} = {one.value:.2f} {one.unit}" for of in lane for one in of])
+        []
+        ['e.speed = 4.42 m/s']
+        """
+        from sgstore.lang.help import condition_values
+
+        with self.file.snapshot():
+            text, values = statement(text, parameters)
+            compiled = compile_query(text, self.catalog(), values)
+            view = self._view(self.file.frame(_ref(frame)), compiled.bound)
+            return condition_values(compiled.bound, view, binding)
 
     def _nearest(
         self, ref: FrameRef, text: str, parameters: Mapping[str, object]

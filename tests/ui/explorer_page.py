@@ -75,8 +75,11 @@ JOINED: Final = r"""() => {
   const ends = /[\p{L}\p{N}.,:;!?)]$/u, begins = /^[\p{L}\p{N}]/u, number = /(?:^|\s)[\d.,]*\d\p{L}{4,}/u;
   const boxed = one => !/^(?:inline|contents)$/.test(getComputedStyle(one).display);
   const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT), found = [];
-  const parents = node => { const all = []; for (let at = node.parentElement; at; at = at.parentElement) all.push(at);
-    return all; };
+  const parents = node => {
+    const all = [];
+    for (let at = node.parentElement; at; at = at.parentElement) all.push(at);
+    return all;
+  };
   const rectOf = (node, from, to) => {
     const range = document.createRange();
     range.setStart(node, from);
@@ -85,8 +88,11 @@ JOINED: Final = r"""() => {
   };
   let before = null;
   for (let node = walker.nextNode(); node; node = walker.nextNode()) {
-    const text = node.data, one = node.parentElement;
-    if (one.closest(".cm-editor, pre, code, script, style, noscript, title, option, [hidden]")) { before = null; continue; }
+    const text = node.data, other = "pre, code, script, style, noscript, title, option, [hidden]";
+    if (node.parentElement.closest(`.cm-editor, ${other}`)) {
+      before = null;
+      continue;
+    }
     if (!text) continue;
     if (number.test(text)) found.push(text);
     if (before && ends.test(before.data) && begins.test(text)) {

@@ -317,6 +317,25 @@ def test_a_rule_of_the_library_is_checked(page: Any, town_store: Path) -> None:
     expect(page.locator(".tile")).to_have_count(violations)
 
 
+def test_each_condition_has_its_measured_value(page: Any, town_store: Path) -> None:
+    query = f"{NEAR} WHERE e.speed > 3 AND dist(e, v) < 10 AND moving(v)"
+    search(page, query)
+    open_first(page)
+    at = re.search(r"#(\d+)", page.locator(".transport .time").inner_text())
+    assert at
+    text = f"{NEAR} RETURN frame.seq AS s, e.speed AS a, dist(e, v) AS b ORDER BY s"
+    rows = {row[0]: row[1:] for row in Store(town_store).find(text).rows()}
+    row = page.locator(".conditions > li").filter(has_text="e.speed > 3")
+    expect(row).to_contain_text(re.compile(r"✓\s*e.speed > 3\s*\d+(\.\d+)? m/s"))
+    assert f"{rows[int(at[1])][0]:.4g} m/s" in row.inner_text()
+    expect(page.locator(".conditions > li", has_text="dist")).to_contain_text(re.compile(r"\d m$"))
+    expect(page.locator(".conditions summary")).to_contain_text(re.compile(r"v\.speed: [\d.]+ m/s"))
+    query = f"{NEAR} WHERE e.speed > 300"
+    search(page, query)
+    page.locator(".nearest button", has_text="town#").click()
+    expect(page.locator(".conditions > li")).to_contain_text(re.compile(r"✗.* [\d.]+ m/s"))
+
+
 def test_matches_that_a_filter_hides_are_told(page: Any) -> None:
     def answer(route: Any) -> None:
         told = route.fetch().json()

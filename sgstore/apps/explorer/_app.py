@@ -44,7 +44,7 @@ T = TypeVar("T")
 MOST_QUESTIONS: Final = 8
 """Largest number of long queries at the same time. Further queries are rejected with status 503."""
 
-SMALL: Final = "parts", "why"
+SMALL: Final = "parts", "values", "why"
 """Names of short queries about one match. They have an additional slot and sandbox process."""
 
 TIMEOUT_S: Final = 60.0

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict
 from itertools import islice
 from typing import Any, Final
 
@@ -80,6 +81,13 @@ def _told_parts(store: Store, question: dict[str, Any], _: int) -> Iterator[Repl
     yield store.parts(text, question["frame"], binding, **values).as_dict()
 
 
+def _told_values(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
+    """Yield the values in the conditions of a pattern in a frame: by lane and condition."""
+    text, frame, binding = question["text"], question["frame"], question["binding"] or {}
+    found = store.condition_values(text, frame, binding, **question["parameters"])
+    yield {"values": [[[*map(asdict, of)] for of in lane] for lane in found]}
+
+
 def _told_why(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
     """Yield the first part of a pattern that fails in a frame, and numbers with which it would be true."""
     text, values, frame = question["text"], question["parameters"], question["frame"]
@@ -139,6 +147,7 @@ QUESTIONS: Final[Mapping[str, Asked]] = {
     "rows": _told_rows,
     "sql": _told_rows,
     "parts": _told_parts,
+    "values": _told_values,
     "why": _told_why,
     "nearest": _told_nearest,
     "check": _told_check,

@@ -12,16 +12,26 @@ from sgstore.lang.help._notes import (
 )
 from sgstore.lang.help._pattern_parts import PatternPart, has_nodes, parts_of, separable
 from sgstore.lang.help._pattern_text import in_words, pattern_text
-from sgstore.lang.help._why_not import WhyNot, WhyNotSteps, events_in, looked_up, why_not
+from sgstore.lang.help._why_not import (
+    ConditionValues,
+    WhyNot,
+    WhyNotSteps,
+    condition_values,
+    events_in,
+    looked_up,
+    why_not,
+)
 
 __all__ = [
     "Compared",
+    "ConditionValues",
     "PatternPart",
     "WhyNot",
     "WhyNotSteps",
     "absent_part",
     "compared_in_check",
     "compared_in_query",
+    "condition_values",
     "events_in",
     "has_nodes",
     "in_words",

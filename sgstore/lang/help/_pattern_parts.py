@@ -53,6 +53,8 @@ class PatternPart:
         The same conditions without calls of predicates.
     call : str
         Call of the predicate whose definition this part is from; empty if the part is written in the query.
+    tests : tuple of Bound
+        The same conditions as expressions.
     """
 
     text: str
@@ -63,6 +65,7 @@ class PatternPart:
     conditions: tuple[str, ...]
     meanings: tuple[str, ...]
     call: str = ""
+    tests: tuple[b.Bound, ...] = ()
 
 
 _Atom = b.Edge | b.Node | b.Bound
@@ -173,7 +176,9 @@ def _told(
         DrawnEdge(writer.name(edge.src), writer.name(edge.dst), _label(edge), edge.both)
         for edge in edges
     )
-    return PatternPart(text, number, query, labels, drawn, tuple(tests), meanings, call)
+    return PatternPart(
+        text, number, query, labels, drawn, tuple(tests), meanings, call, tuple(whole)
+    )
 
 
 def _written(condition: b.Bound, writer: Writer) -> str:

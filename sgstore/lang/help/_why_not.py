@@ -14,10 +14,12 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.lang import ir as b
+from sgstore.lang.help._pattern_parts import parts_of
 from sgstore.lang.help._pattern_text import Writer, joined_calls, kind_label, text_written
 from sgstore.lang.memory import Binding, FrameView, NodePair, ScopeSearch, expression
 from sgstore.lang.operators import MIRRORED
 from sgstore.lang.sql import TRACE_OF_FRAME, happened_in_frame, leaves, told_events
+from sgstore.model.pair_numbers import PAIR_FUNCTIONS
 from sgstore.model.vocabulary import EVENT_KINDS, KINDS, RELATIONS
 
 if TYPE_CHECKING:
@@ -431,6 +433,125 @@ def _values(condition: b.Bound, at: Binding, query: b.Query, writer: Writer) -> 
         else:
             texts[name] = _shown(name, _value(leaf, at, query))
     return " AND ".join(texts.values())
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredValue:
+    """Value in a condition of a pattern, for one frame and one binding.
+
+    Attributes
+    ----------
+    name : str
+        Text in the query language, such as ``e.speed``.
+    value : float, int, str or None
+        ``None`` means unknown.
+    unit : str
+        Unit of a number; empty without one.
+    """
+
+    name: str
+    value: float | str | None
+    unit: str
+
+
+ConditionValues = tuple[tuple[tuple[MeasuredValue, ...], ...], ...]
+"""Values for each part of a pattern, in each of its conditions. Truth values are left out."""
+
+
+def condition_values(
+    query: b.Query, view: FrameView, binding: Mapping[str, int]
+) -> ConditionValues:
+    """Return the values in the conditions of a pattern, whether they hold or not.
+
+    Parameters
+    ----------
+    query : Query
+        A bound query.
+    view : FrameView
+    binding : mapping of str to int
+        Node ids of variables. For other variables, the nodes that match or come nearest.
+
+    Returns
+    -------
+    tuple
+        For each part of the pattern (:func:`parts_of`), and each of its conditions. Without a binding for the
+        part, or in conditions on other frames, there are no values.
+
+    Raises
+    ------
+    QueryNameError
+        The pattern does not contain the variable.
+    """
+    found = list[tuple[tuple[MeasuredValue, ...], ...]]()
+    for part in parts_of(query, {name: (node,) for name, node in binding.items()}):
+        tests = tuple(test for test in part.tests if not b.is_temporal(test))
+        at = _nearest_binding(part.query, tests, view) if tests else None
+        writer = Writer(part.query.first, query.calls).expanded()
+        found.append(
+            tuple(
+                () if at is None or test not in tests else tuple(_measured(test, at, query, writer))
+                for test in part.tests
+            )
+        )
+    return tuple(found)
+
+
+def _nearest_binding(query: b.Query, tests: Sequence[b.Bound], view: FrameView) -> Binding | None:
+    """Return the binding that makes conditions true, or comes nearest. Missing edges are left out."""
+    apart = {part for test in tests for part in b.conjuncts(test)}
+    scope = query.first
+    pinned = replace(scope, where=tuple(one for one in scope.where if one not in apart))
+    edges = tuple(replace(edge, named=True) if edge.high == 1 else edge for edge in scope.edges)
+    ways = [replace(pinned, edges=edges)]
+    if not any(b.edges_of(test) for test in tests):
+        ways.append(replace(pinned, edges=()))
+    for way in ways:
+        best, nearest = math.inf, None
+        for at in islice(_bindings(way, query, view), MOST_LOOKED_AT):
+            short = sum(shortfall(test, at, query) for test in tests)
+            if nearest is None or short < best:
+                best, nearest = short, replace(at, nodes={**at.nodes}, edges={**at.edges})
+            if best == 0:
+                break
+        if nearest is not None:
+            return nearest
+    return None
+
+
+def _measured(
+    condition: b.Bound, at: Binding, query: b.Query, writer: Writer
+) -> Iterator[MeasuredValue]:
+    seen = set[str]()
+    for leaf in leaves(condition):
+        if isinstance(leaf, b.NodeValue) or (name := writer.expression(leaf)) in seen:
+            continue
+        seen.add(name)
+        value = _value(leaf, at, query)
+        if not isinstance(value, bool):
+            is_number = isinstance(value, int | float)
+            plain = value if value is None or is_number else str(value)
+            yield MeasuredValue(name, plain, _unit(leaf) if is_number else "")
+
+
+_UNITS: Final = {
+    **{one: one for one in ("m", "s", "ns", "m/s", "m/s²", "s²", "1/m", "J")},
+    "degrees": "°",
+}
+"""Unit at the end of a meaning in the catalogue → unit beside a number."""
+
+
+def _unit(leaf: b.Bound) -> str:
+    """Return the unit of a value, from its meaning in the catalogue; empty without one."""
+    match leaf:
+        case b.PairNumber(function=function):
+            meaning = PAIR_FUNCTIONS[function].unit if function in PAIR_FUNCTIONS else ""
+        case b.NodeAttribute(attribute=attribute) | b.EdgeAttribute(attribute=attribute):
+            meaning = attribute.meaning
+        case b.FrameAttribute(attribute=attribute) | b.TraceAttribute(attribute=attribute):
+            meaning = attribute.meaning
+        case _:
+            meaning = ""
+    return _UNITS.get(meaning.rpartition("; ")[2], "")
 
 
 def _shown(name: str, value: Any) -> str:

@@ -1,6 +1,6 @@
 // @ts-check
 // One clock over all that is open: the frame, whether it plays, and what the server says of it.
-import { computed, effect, signal } from "../vendor/core.js";
+import { computed, effect, signal, untracked } from "../vendor/core.js";
 import * as api from "./api.js";
 import { nameOf, seqAt, stillOf, timeAt } from "./data.js";
 import {
@@ -91,6 +91,30 @@ effect(() => {
     missed = isLost(error);
     say(reasonOf(error));
   });
+});
+
+/** Values in the conditions of what is open, at a frame: by lane and condition. They come while nothing plays.
+ * @typedef {{name: string, value: number | string | null, unit: string}} Measured */
+export const measured = signal(/** @type {{of: any, at: number, values: Measured[][][]} | null} */ (null));
+let measuring = false;
+
+/** Ask for the values of the frame that is shown: one request at a time, the next one for the frame of then. */
+async function measure() {
+  const of = lanes.peek(), at = frame.peek(), now = open.peek();
+  if (measuring || playing.peek() || offline.peek() || !now || !of) return;
+  const body = lanesWanted(now, asked.peek());
+  if (!body || !of.lanes.some((/** @type {any} */ lane) => lane.conditions.length)) return;
+  measuring = true;
+  try {
+    const found = await api.json("api/values", { ...body, seq: at, binding: of.binding });
+    if (found.error) say(`no values: ${found.error.reason}`); else measured.value = { of, at, values: found.values };
+  } catch (error) { say(reasonOf(error)); }
+  measuring = false;
+  if (lanes.peek() !== of || frame.peek() !== at) measure();
+}
+effect(() => {
+  lanes.value; frame.value; playing.value; retries.value;
+  untracked(measure);
 });
 
 /** Lanes of the same match in the second store, while that is shown beside. */

@@ -1,6 +1,7 @@
 // @ts-check
 // The pattern as a small drawing that stays still, while its edges and conditions turn ✓ or ✗.
 import { h, htm, useMemo } from "../vendor/core.js";
+import { frame, measured } from "./clock.js";
 import { allHold, written } from "./lanes.js";
 import { lit, open } from "./state.js";
 
@@ -52,7 +53,8 @@ export function PatternDrawing({ lanes, holds }) {
   }, [lanes]);
   if (!drawn) return html`<p class="faint"
     style=${{ padding: "8px 12px" }}>The parts of the pattern stand here when a match of one is open.</p>`;
-  const binding = open.value?.binding || {};
+  const binding = open.value?.binding || {}, found = measured.value;
+  const known = found && found.of === lanes && found.at === frame.value ? found.values : [];
   const state = (/** @type {number} */ at) => (holds[at] === null || holds[at] === undefined ? "faint" : holds[at]
     ? "holds" : "fails");
   const xs = [...drawn.at.values()].map(([x]) => x), middle = (drawn.width - Math.max(...xs) - Math.min(...xs)) / 2;
@@ -85,10 +87,27 @@ export function PatternDrawing({ lanes, holds }) {
       <text x=${x} y=${y + 10} font-size="8.5" text-anchor="middle" fill="var(--faint)">
         ${String(drawn.labels.get(key) || "").slice(0, 14)}</text></g>`)}
   </svg>
-    <ul class="conditions">${drawn.conditions.map(({ text, of, meanings }) => html`<li>${meanings.length
-      ? html`<details><summary><${Sign} of=${of} holds=${holds} /> <code>${text}</code></summary><ul>
-        ${meanings.map(({ text, at }) => html`<li><${Sign} of=${[at]} holds=${holds} /> <code>${text}</code></li>`)}
-        </ul></details>` : html`<${Sign} of=${of} holds=${holds} /> <code>${text}</code>`}</li>`)}</ul></div>`;
+    <ul class="conditions">${drawn.conditions.map(({ text, of, at, meanings }) => {
+      const row = html`<${Sign} of=${of} holds=${holds} /> <code>${text}</code> <${Values} text=${text} at=${at}
+        known=${known} />`;
+      return html`<li>${meanings.length ? html`<details><summary>${row}</summary><ul>
+        ${meanings.map((one) => html`<li><${Sign} of=${one.at.map(([lane]) => lane)} holds=${holds} />
+        ${" "}<code>${one.text}</code> <${Values} ...${one} known=${known} /></li>`)}</ul></details>` : row}</li>`;
+    })}</ul></div>`;
+}
+
+/** The measured values of a condition at the frame that is shown. @param {{text: string, at: [number, number][],
+ *   known: import("./clock.js").Measured[][][]}} props */
+const Values = ({ text, at, known }) => html`<span class="values">${valueText(text,
+  at.flatMap(([lane, condition]) => known[lane]?.[condition] || []))}</span>`;
+
+/** Values in words: that of a condition which begins with it alone, of others each with its name.
+ * @param {string} text @param {import("./clock.js").Measured[]} values */
+export function valueText(text, values) {
+  const told = values.map(({ value, unit }) => (value === null ? "unknown" : typeof value === "number"
+    ? `${Number(value.toPrecision(4))}${unit && unit !== "°" ? " " : ""}${unit}` : value));
+  if (values.length === 1 && text.startsWith(`${values[0]?.name} `)) return told[0] || "";
+  return [...new Set(values.map(({ name }, i) => `${name}: ${told[i]}`))].join(", ");
 }
 
 /** Whether some lanes hold, as a sign. @param {{of: number[], holds: (boolean | null)[]}} props */
@@ -100,15 +119,20 @@ function Sign({ of, holds }) {
 
 /** Conditions as the query writes them, with the lanes of each; words of the library also with their meaning.
  * @param {import("./lanes.js").Lane[]} lanes
- * @returns {{text: string, of: number[], meanings: {text: string, at: number}[]}[]} */
+ * @returns {{text: string, of: number[], at: [number, number][],
+ *   meanings: {text: string, at: [number, number][]}[]}[]} `at`: lanes, and numbers of their conditions */
 export function conditionsOf(lanes) {
   return written(lanes).flatMap(({ text, of }) => {
     const one = lanes[of[0] ?? 0];
     if (!one) return [];
     if (one.call) {
-      return [{ text, of, meanings: of.flatMap((at) => (lanes[at]?.meanings || []).map((text) => ({ text, at }))) }];
+      const meanings = of.flatMap((lane) => (lanes[lane]?.meanings || []).map((meaning, i) => ({ text: meaning,
+        at: [/** @type {[number, number]} */ ([lane, i])] })));
+      return [{ text, of, at: meanings.flatMap(({ at }) => at), meanings }];
     }
-    return one.conditions.map((text, i) => ({ text, of, meanings: (one.meanings[i] || text) === text ? []
-      : of.map((at) => ({ text: one.meanings[i] || "", at })) }));
+    return one.conditions.map((text, i) => {
+      const at = of.map((lane) => /** @type {[number, number]} */ ([lane, i])), meaning = one.meanings[i] || text;
+      return { text, of, at, meanings: meaning === text ? [] : [{ text: meaning, at }] };
+    });
   });
 }
