@@ -19,7 +19,7 @@ from urllib.parse import quote
 
 import duckdb
 import pytest
-from explorer_page import NEAR, expect
+from explorer_page import NEAR, expect, search
 
 from sgstore.apps.demo import SMALL
 from sgstore.apps.report import report
@@ -190,6 +190,47 @@ def test_a_link_on_a_page_of_another_site_opens(page: Any, served: Served) -> No
     page.locator("a").click()
     expect(shown(page)).to_contain_text("town#12 ")
     page.unroute(f"{site}**")
+
+
+def test_the_last_selection_is_offered_again(page: Any, town_store: Path) -> None:
+    file, start = town_store.with_name(f"{town_store.name}.selection.txt"), page.url.partition("#")[0]
+    offer = page.get_by_role("complementary", name="Last selection")
+    if offer.count():  # of another test
+        offer.get_by_role("button", name="Forget").click()
+    search(page, NEAR)
+    with page.expect_response("**/api/selection"):
+        for at in (0, 1):
+            page.locator(".tile input").nth(at).check()
+    page.wait_for_function("document.querySelector('nav .badge')?.textContent === '2'")
+    page.wait_for_timeout(600)  # it is kept a little later
+    page.goto("about:blank")
+    page.goto(start)
+    expect(offer).to_contain_text("2 matches of this store were selected before")
+    assert file.read_text().startswith("town*")
+    search(page, NEAR)
+    expect(page.locator(".tile input").first).not_to_be_checked()
+    with page.expect_response("**/api/selection"):
+        page.locator(".tile input").nth(2).check()  # what is offered is not lost by a new one
+    page.goto("about:blank")
+    page.goto(start)
+    expect(offer).to_contain_text("3 matches")
+    offer.get_by_role("button", name="Select again").click()
+    expect(offer).to_have_count(0)
+    expect(page.locator("nav .badge")).to_have_text("3")
+    page.wait_for_function("location.hash.includes('tick=')")
+    link = page.url
+    page.goto("about:blank")
+    page.goto(link)
+    expect(page.locator("nav .badge")).to_have_text("3")
+    expect(offer).to_have_count(0)
+    page.get_by_role("button", name="Selection").click()
+    with page.expect_response("**/api/selection"):
+        page.get_by_role("button", name="remove all").click()
+    page.goto("about:blank")
+    page.goto(start)
+    page.locator(".card").first.wait_for()
+    expect(offer).to_have_count(0)
+    assert file.read_text() == ""
 
 
 def answer_many(route: Any) -> None:

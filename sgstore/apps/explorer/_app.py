@@ -8,7 +8,7 @@ import os
 import threading
 import uuid
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from dataclasses import astuple
 from functools import partial
 from pathlib import Path
@@ -21,10 +21,11 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from sgstore.apps.explorer._guard import Guard
-from sgstore.apps.explorer._requests import RequestError, fields_of, one_of, taken
+from sgstore.apps.explorer._requests import MOST_BODY, RequestError, fields_of, one_of, taken
 from sgstore.apps.explorer._store_reader import READS, Reads
 from sgstore.apps.explorer._wire import PAGE, as_json
 from sgstore.apps.sandbox import Errand, SandboxPool
+from sgstore.base.output_files import write_bytes
 from sgstore.base.quoting import is_statement
 from sgstore.errors import QueryError, SgstoreError, SqlError, StoreError
 from sgstore.model.user_notes import Note, NotesFile, write_table
@@ -153,7 +154,7 @@ class Explorer:
     other : Path, optional
         A second store for comparison.
     write_to : Path, optional
-        Folder for locks and clips; without it only tags are written.
+        Folder for locks and clips; without it only tags and the last selection are written.
 
     Attributes
     ----------
@@ -174,6 +175,7 @@ class Explorer:
             self.stores["b"] = Store(other)
         self.write_to = write_to
         self.notes = NotesFile(Path(path))
+        self.selection = Path(path).with_name(f"{Path(path).name}.selection.txt")
         self.reads = {side: Reads(store) for side, store in self.stores.items()}
         self._stamp = self.notes.stamp()
         self._folder = TemporaryDirectory(prefix="sgstore-notes-")
@@ -330,6 +332,20 @@ class Explorer:
         notes = [astuple(note) for note in found]
         return JSONResponse({"notes": notes, "file": self.notes.path.name})
 
+    async def last_selection(self, request: Request) -> Response:
+        """Endpoint with the last selection of the store: ticked matches as text. POST replaces it."""
+        if request.method == "POST":
+            ticks = taken(await fields_of(request), "ticks")["ticks"]
+            await self.threaded(write_bytes, self.selection, ticks.encode())
+            return JSONResponse({"file": self.selection.name})
+        return JSONResponse({"ticks": await self.threaded(self._ticks)})
+
+    def _ticks(self) -> str:
+        with suppress(FileNotFoundError), self.selection.open("rb") as file:
+            ticks = file.read(MOST_BODY).decode(errors="replace")
+            return str(taken({"ticks": ticks}, "ticks")["ticks"])
+        return ""
+
     async def work(self, request: Request, name: str) -> Response:
         """Endpoint that runs a long task, such as an export, and streams its progress and result as JSON."""
         fields = await fields_of(request)
@@ -414,6 +430,8 @@ def application(explorer: Explorer, token: str, hosts: tuple[str, ...], cookie: 
         ("DELETE /api/find/{key}", explorer.cancel),
         ("GET /api/notes", explorer.tags),
         ("POST /api/notes", explorer.tags),
+        ("GET /api/selection", explorer.last_selection),
+        ("POST /api/selection", explorer.last_selection),
         *((f"{_METHODS[name]} /api/{name}", partial(explorer.read, name=name)) for name in READS),
         *((f"POST /api/{name}", partial(explorer.one, ask=name)) for name in _QUESTIONS),
         *((f"POST /api/{name}", partial(explorer.work, name=name)) for name in _WORK),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
@@ -102,6 +103,13 @@ def _text(value: object, name: str) -> str:
     return value
 
 
+def _ticks(value: object, name: str) -> str:
+    """Validate a selection: ticked matches as text, in the form of the page's address."""
+    if not isinstance(value, str) or not _TICKS.fullmatch(value):
+        raise RequestError(f"{name}: expected ticked matches as in the address of the page")
+    return value
+
+
 def _parameters(value: Any, _: str) -> dict[str, Any]:
     """Validate the values of query parameters: numbers, texts, truth values, or lists of these."""
     found = value or {}
@@ -168,6 +176,7 @@ def _refuse_constant(word: str) -> float:
     raise ValueError(f"{word} is not a JSON number")
 
 
+_TICKS: Final = re.compile(r"[\w%.*!~'()-]*", re.ASCII)
 _node: Final = partial(_whole, least=LEAST_NODE)
 
 USUAL: Final = {"abstraction": "RSV", "format": "mcap", "id": "", "note": ""}
@@ -185,6 +194,7 @@ FIELDS: Final[Mapping[str, Callable[[Any, str], Any]]] = {
     "parameters": _parameters,
     "binding": _binding,
     "clips": _clips,
+    "ticks": _ticks,
     "frames": partial(_spans, width=2),
 }
 """Name of a request field → function that validates it."""

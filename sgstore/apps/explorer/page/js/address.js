@@ -1,11 +1,11 @@
 // @ts-check
 // The address of what is shown: all behind '#', so that it never reaches the server; back and forward; links.
-import { batch, computed, effect } from "../vendor/core.js";
+import { batch, computed, effect, signal } from "../vendor/core.js";
 import * as api from "./api.js";
 import { frame } from "./clock.js";
 import { placeIn } from "./data.js";
 import {
-  answer, drop, find, keyOf, matches, notice, open, openFrame, openMatch, parametersOf, playing, reasonOf, refresh, say,
+  answer, drop, find, isLost, keyOf, matches, notice, open, openFrame, openMatch, parametersOf, playing, reasonOf, refresh, say,
     second,
   seq, side, store, text, ticked, traces, values, view,
 } from "./state.js";
@@ -63,6 +63,40 @@ export function ticksOf(text) {
 }
 
 const ticks = computed(() => textOfTicks(ticked.value.values()));
+
+// The last selection of the store -----------------------------------------------------------------------------------
+
+/** Matches of the last selection that are not ticked; they are offered again. */
+export const offered = signal(/** @type {Map<string, Match>} */ (new Map()));
+
+/** Offer the last selection of the store, and keep each one from now on. What is offered stays part of it. */
+export async function followSelection() {
+  const { ticks: told } = await api.json("api/selection"), left = [...ticksOf(told)].filter(([key, { trace, last }]) => (
+    !ticked.value.has(key) && last < (traces.value.get(trace)?.frames || 0)));
+  offered.value = new Map(left);
+  let known = told, waits = /** @type {any} */ (0), begun = false, stop = () => {};
+  const save = async (/** @type {string} */ ticks) => {
+    try { await api.json("api/selection", { ticks }); known = ticks; } catch (error) {
+      if (isLost(error)) return; // the next one is kept
+      say(`the selection is not kept: ${reasonOf(error)}`);
+      stop();
+    }
+  };
+  stop = effect(() => {
+    const now = textOfTicks(new Map([...offered.value, ...ticked.value]).values());
+    clearTimeout(waits);
+    if (begun && now !== known) waits = setTimeout(save, 400, now);
+    begun = true;
+  });
+}
+
+/** Tick the matches of the last selection again. */
+export function tickOffered() {
+  batch(() => {
+    ticked.value = new Map([...offered.value, ...ticked.value]);
+    offered.value = new Map();
+  });
+}
 
 // Written ---------------------------------------------------------------------------------------------------------
 

@@ -2,7 +2,7 @@
 // The page: its head, the search, what was found, and the view that is open; keys.
 import { effect, h, htm, render, untracked, useEffect, useState } from "../vendor/core.js";
 import * as api from "./api.js";
-import { copyCommand, copyLink, followPlace, readAddress } from "./address.js";
+import { copyCommand, copyLink, followPlace, followSelection, offered, readAddress, tickOffered } from "./address.js";
 import { askWhy, frame } from "./clock.js";
 import { forget, retry } from "./data.js";
 import { Editor, focusEditor, NumberSlider } from "./editor.js";
@@ -207,6 +207,16 @@ effect(() => {
   untracked(() => { paints.value++; });
 });
 
+/** The last selection of the store, which a page without it offers again. */
+function LastSelection() {
+  const many = offered.value.size, forget = () => { offered.value = new Map(); };
+  if (!many) return null;
+  return html`<aside class="notice" aria-label="Last selection">${many.toLocaleString("en")}
+    ${" "}${many === 1 ? "match" : "matches"} of this store ${many === 1 ? "was" : "were"} selected before.
+    ${" "}<button class="small" onClick=${tickOffered}>Select again</button>
+    ${" "}<button class="small" onClick=${forget}>Forget</button></aside>`;
+}
+
 /** What the page has to say of the store and the server. */
 function Notices() {
   const close = () => { notice.value = ""; };
@@ -214,7 +224,7 @@ function Notices() {
     ${notice.value ? html`<p class="notice" role="alert">${notice.value} <button class="small"
       onClick=${close}>Close</button></p>` : null}
     ${changed.value ? html`<p class="notice" role="status">The store has changed since this was asked.
-      ${" "}<button class="small" onClick=${askAgain}>Ask again</button></p>` : null}`;
+      ${" "}<button class="small" onClick=${askAgain}>Ask again</button></p>` : null}<${LastSelection} />`;
 }
 
 const LOOK = 2000; // ms between looks at the store
@@ -253,6 +263,7 @@ async function begin() {
   render(html`<${App} />`, place);
   followPlace(); // the address may change while it is read
   await readAddress();
+  followSelection().catch((error) => say(reasonOf(error)));
   let stamp = "";
   effect(() => { // another state of the store
     const { stamp: now, store: name, other } = store.value;
