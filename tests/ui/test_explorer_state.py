@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import shlex
 import shutil
 import socket
 import subprocess
@@ -193,7 +194,10 @@ def test_a_link_on_a_page_of_another_site_opens(page: Any, served: Served) -> No
 
 
 def test_the_last_selection_is_offered_again(page: Any, town_store: Path) -> None:
-    file, start = town_store.with_name(f"{town_store.name}.selection.txt"), page.url.partition("#")[0]
+    file, start = (
+        town_store.with_name(f"{town_store.name}.selection.txt"),
+        page.url.partition("#")[0],
+    )
     offer = page.get_by_role("complementary", name="Last selection")
     if offer.count():  # of another test
         offer.get_by_role("button", name="Forget").click()
@@ -231,6 +235,33 @@ def test_the_last_selection_is_offered_again(page: Any, town_store: Path) -> Non
     page.locator(".card").first.wait_for()
     expect(offer).to_have_count(0)
     assert file.read_text() == ""
+
+
+def test_a_selection_is_downloaded_without_write_to(
+    page: Any, town_store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    offer = page.get_by_role("complementary", name="Last selection")
+    if offer.count():  # of another test
+        offer.get_by_role("button", name="Forget").click()
+    search(page, f"{NEAR} WHERE e.speed > 3")
+    page.locator(".tile input").first.check()
+    page.get_by_role("button", name="Selection").click()
+    expect(page.get_by_role("button", name="Export clips")).to_have_count(0)
+    page.get_by_label("Name").fill("two words")
+    with page.expect_download() as told:
+        page.get_by_role("button", name="Download a lock").click()
+    assert told.value.suggested_filename == "two words.lock"
+    told.value.save_as(tmp_path / "two words.lock")
+    expect(page.get_by_text("1 case downloaded")).to_be_visible()
+    page.get_by_label("as", exact=True).select_option("nx")
+    command = shlex.split(page.locator("form + p + p code").inner_text())
+    assert command[:2] == ["sgstore", "export"]
+    monkeypatch.chdir(tmp_path)
+    subprocess.run([sys.executable, "-m", *command], check=True, capture_output=True)
+    match = next(iter(Store(town_store).find(f"{NEAR} WHERE e.speed > 3").intervals()))
+    (file,) = (tmp_path / "two words").iterdir()
+    assert len(file.read_text().splitlines()) == match.end_seq - match.start_seq + 1
+    page.get_by_role("button", name="remove all").click()
 
 
 def answer_many(route: Any) -> None:

@@ -352,7 +352,7 @@ class Explorer:
         question = {"ask": name, **taken(fields, *_WORK[name])}
         if "name" in question:
             question["to"] = str(self.target(question.pop("name")))
-        else:
+        elif name == "diff":
             if "b" not in self.stores:
                 told = "the server has no second store; start 'sgstore serve STORE' with --compare OTHER"
                 raise RequestError(told, 404)
@@ -392,6 +392,7 @@ _QUESTIONS: Final[Mapping[str, tuple[str, ...]]] = {
 }
 _WORK: Final[Mapping[str, tuple[str, ...]]] = {
     **dict.fromkeys(("lock", "export"), ("clips", "name", "format")),
+    "download": ("clips",),
     "diff": ("abstraction",),
 }
 """Names of queries and longer tasks → fields of their requests."""

@@ -28,7 +28,7 @@ from sgstore.testsets.coverage import (
     growth,
 )
 from sgstore.testsets.diff import by_frame, scenes
-from sgstore.testsets.locks import lock_of
+from sgstore.testsets.locks import ENDING, Lock, lock_of
 from sgstore.testsets.scenes import phrases
 
 if TYPE_CHECKING:
@@ -96,13 +96,22 @@ def select(store: Store, clips: Clips, abstraction: str) -> dict[str, Any]:
 
 def lock(store: Store, clips: Clips, to: str, **_: str) -> dict[str, Any]:
     """Write the selected clips as a lock file (list of test cases with checksums)."""
-    path = Path(to if to.endswith(".lock") else f"{to}.lock")
+    path, made = Path(to if to.endswith(ENDING) else f"{to}{ENDING}"), _locked(store, clips)
+    made.write(path)
+    return {"result": {"file": str(path), "cases": len(made.cases)}}
+
+
+def download(store: Store, clips: Clips) -> dict[str, Any]:
+    """Return the text of a lock with the selected clips. Nothing is written."""
+    made = _locked(store, clips)
+    return {"result": {"text": made.text(), "cases": len(made.cases)}}
+
+
+def _locked(store: Store, clips: Clips) -> Lock:
     with store.file.snapshot():
         found = _frames(store, clips)
         parts = [(ids, StateColumns(store.file).log_times(*clip), "") for clip, ids, _ in found]
-        made = lock_of(store, parts, {"chosen": "in the explorer"}, progress=_done)
-    made.write(path)
-    return {"result": {"file": str(path), "cases": len(made.cases)}}
+        return lock_of(store, parts, {"chosen": "in the explorer"}, progress=_done)
 
 
 def export(store: Store, clips: Clips, to: str, format: str) -> dict[str, Any]:

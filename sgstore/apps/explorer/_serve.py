@@ -77,7 +77,7 @@ def serve(  # noqa: PLR0913  one argument per option
     other : Path, optional
         A second store for comparison.
     write_to : Path, optional
-        Folder for locks and clips; without it the page writes only tags.
+        Folder for locks and clips; without it the page writes only tags and the last selection.
     browse : bool
         True to open the address in a browser.
     link : str

@@ -151,7 +151,7 @@ QUESTIONS: Final[Mapping[str, Asked]] = {
     "why": _told_why,
     "nearest": _told_nearest,
     "check": _told_check,
-    **dict.fromkeys(("coverage", "select", "lock", "export", "diff"), _measured),
+    **dict.fromkeys(("coverage", "select", "lock", "download", "export", "diff"), _measured),
 }
 """Kind of a query → function that answers it from the store, the query, and the limit of rows."""
 

@@ -229,7 +229,7 @@ async function showFrame(at, told, current) {
 // Links -------------------------------------------------------------------------------------------------------------
 
 /** @param {string} words @param {string} done */
-const copy = (words, done) => navigator.clipboard.writeText(words).then(() => say(done), () => say(words));
+export const copy = (words, done) => navigator.clipboard.writeText(words).then(() => say(done), () => say(words));
 
 export function copyLink() {
   write();

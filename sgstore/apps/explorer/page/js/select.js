@@ -2,6 +2,7 @@
 // The selection: ticked matches as a test set, with their length, and as a lock or clips.
 import { computed, h, htm, useEffect, useLayoutEffect, useRef, useState } from "../vendor/core.js";
 import * as api from "./api.js";
+import { copy, quoted } from "./address.js";
 import { arrived, seconds, timesOf } from "./data.js";
 import { Table, useWork, Waiting } from "./sheets.js";
 import { keyOf, openMatch, reasonOf, store, tick, ticked, view } from "./state.js";
@@ -70,30 +71,50 @@ function Clips({ all }) {
     })}</div></div>`;
 }
 
-/** A lock or clips of what is ticked, below the folder that the page may write to. */
+/** Let the browser save a text as a file. @param {string} text @param {string} name */
+function saveText(text, name) {
+  const link = document.createElement("a"), address = URL.createObjectURL(new Blob([text], { type: "text/plain" }));
+  Object.assign(link, { href: address, download: name });
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(address), 60_000);
+}
+
+/** The command that exports the clips of a lock. @param {string} name @param {string} format */
+const exportCommand = (name, format) => `sgstore export ${quoted(store.value.path)} --lock ${quoted(`${name}.lock`)}`
+  + ` --as ${format} --to ${quoted(name)}`;
+
+/** A lock or clips of what is ticked: downloaded, or below the folder that the page may write to. */
 function Keep() {
-  const [made, tell] = useState("");
+  const [made, tell] = useState(""), [name, setName] = useState("tests"), [format, setFormat] = useState("mcap");
+  const { writing } = store.value, command = exportCommand(name.replace(/\.lock$/, ""), format);
   const write = async (/** @type {any} */ event) => {
     event.preventDefault();
-    const form = new FormData(event.target), how = event.submitter?.value || "lock";
+    const how = event.submitter?.value || "download";
     tell("working …");
     try {
-      const body = { clips: clips.value, name: form.get("name"), format: form.get("format") };
+      const body = { clips: clips.value, ...(how === "download" ? {} : { name, format }) };
       const found = await api.work(`api/${how}`, body, (done, of) => tell(`${done} of ${of}`));
       const lost = found.losses?.length ? `; lost: ${found.losses.join("; ")}` : "";
-      tell(how === "lock" ? `${found.cases} cases in ${found.file}`
+      if (how === "download") saveText(found.text, `${name.replace(/\.lock$/, "")}.lock`);
+      tell(how === "download" ? `${found.cases} ${found.cases === 1 ? "case" : "cases"} downloaded${
+        found.cases < ticked.value.size ? "; clips that overlap are one case" : ""}`
+        : how === "lock" ? `${found.cases} cases in ${found.file}`
         : `${found.files.length} files in ${found.folder}${lost}`);
     } catch (error) { tell(reasonOf(error)); }
   };
-  if (!store.value.writing) {
-    return html`<p
-      class="note">Start <code>sgstore serve</code> with <code>--write-to DIR</code> to write locks and clips.</p>`;
-  }
   return html`<form class="row wrap" onSubmit=${write}>
-      <label>Name <input name="name" required pattern="[^\\/\\\\.][^\\/\\\\]*" defaultValue="tests" /></label>
-      <button class="main" value="lock">Write a lock</button>
-      <label>as <select name="format">${FORMATS.map((f) => html`<option>${f}</option>`)}</select></label>
-      <button value="export">Export clips</button></form><p role="status">${made}</p>`;
+      <label>Name <input name="name" required pattern="[^\\/\\\\.][^\\/\\\\]*" value=${name}
+        onInput=${(/** @type {{target: HTMLInputElement}} */ e) => setName(e.target.value)} /></label>
+      <button class="main" value="download" title="a file with the clips and their checksums">Download a lock</button>
+      ${writing ? html`<button value="lock">Write a lock</button>` : null}
+      <label>as <select name="format" value=${format}
+        onChange=${(/** @type {{target: HTMLInputElement}} */ e) => setFormat(e.target.value)}>
+        ${FORMATS.map((f) => html`<option>${f}</option>`)}</select></label>
+      ${writing ? html`<button value="export">Export clips</button>` : null}</form><p role="status">${made}</p>
+    <p class="row wrap"><span class="faint">Cut the clips out with the downloaded lock:</span> <code>${command}</code>
+      ${" "}<button class="small" onClick=${() => copy(command, "command copied")}>Copy</button></p>
+    ${writing ? null : html`<p class="faint">With <code>sgstore serve … --write-to DIR</code>, this page exports the
+      clips itself.</p>`}`;
 }
 
 export function Selection() {
