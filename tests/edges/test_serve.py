@@ -594,7 +594,7 @@ def test_coverage_is_that_of_the_verb(page: Page, store: Store) -> None:
     assert told["of"] == len(table.rows)
     assert [row[1] for row in told["rows"]] == table.column("class")
     words = told["words"]
-    assert len(words) == min(60, len(table.rows))
+    assert len(words) == min(200, len(table.rows))
     kinds = {
         store.graph(str(table.rows[0][-1])).nodes[node]["kind"]
         for node in store.graph(str(table.rows[0][-1])).nodes

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import pytest
 from explorer_page import AXE, JOINED, NEAR, expect, faults, open_first, search
 
+from sgstore.apps.explorer._plain_words import RELATION_WORDS
 from sgstore.apps.report import report
 from sgstore.query import Store
 
@@ -320,19 +321,62 @@ def test_coverage_is_told_in_words_pictures_and_gaps(page: Any) -> None:
     labels = cells.evaluate_all("all => all.map(one => one.getAttribute('aria-label'))")
     assert all(label.endswith(": in no frame") for label in labels)
     pairs = [label.removesuffix(": in no frame").split(" with ") for label in labels]
+    names = {words: name for name, words in RELATION_WORDS.items()}
+    middle = re.compile(rf" ({'|'.join(sorted(names, key=len, reverse=True))}) the ego$")
     place, pair = next(
         (place, pair)
         for place, pair in enumerate(pairs)
-        if all(len(feature.split()) == 3 for feature in pair)
+        if all(middle.search(feature) for feature in pair)
     )
     cells.nth(place).focus()
     cells.nth(place).press("Enter")
     expect(page.locator(".status")).to_contain_text("0 matches")
     told = page.locator(".nearest")  # both features of the pair, and a frame with one of them
-    for feature in pair:
-        expect(told).to_contain_text(f"[:{feature.split()[1]}")
+    for found in map(middle.search, pair):
+        assert found
+        expect(told).to_contain_text(f"[:{names[found[1]]}")
     expect(told).to_contain_text("together with")
     expect(told.get_by_role("button")).to_have_text(re.compile(r"town#\d+"))
+
+
+JARGON: Final = re.compile(
+    r"\b(RSV|ER|EL|is_?[iI]n|(?:to|in|at)[A-Z]\w+|\w+_(?:near|coll|hazard|light)|Root Road|Opposing|Ego Lane"
+    r"|abstractions?|class(?:es)?|[0-9a-f]{12,})\b"
+)
+
+IN_SIGHT: Final = """() => {
+  const sheet = document.querySelector(".sheet").cloneNode(true);
+  sheet.querySelectorAll("code, option").forEach(one => one.remove());
+  const walker = document.createTreeWalker(sheet, NodeFilter.SHOW_TEXT), texts = [];
+  while (walker.nextNode()) texts.push(walker.currentNode.data);
+  return texts.join("\\n");
+}"""
+"""Texts of the sheet without queries, and without the choice of the abstraction."""
+
+
+def test_coverage_has_no_jargon(page: Any) -> None:
+    page.get_by_role("button", name="Coverage").click()
+    signs = {
+        "Kinds of scenes": ".classes .card",
+        "Growth": ".chart",
+        "Matrix of gaps": ".matrix",
+        "Combinations": "text=Missing",
+    }
+    for tab, sign in signs.items():
+        page.get_by_role("button", name=tab).click()
+        page.locator(sign).first.wait_for()
+        text = page.evaluate(IN_SIGHT)
+        assert len(text) > 300
+        assert JARGON.findall(text) == []
+    choice = page.get_by_label("Scenes of one kind have the same")
+    expect(choice.locator("option:checked")).to_have_text(
+        "objects, their relations and lanes (RSV)"
+    )
+    choice.select_option("E")
+    page.get_by_role("button", name="Kinds of scenes").click()
+    card = page.locator(".classes .card").first
+    expect(card).to_have_attribute("title", re.compile(r"class \S+ of E$"))
+    expect(page.locator("td[title]").first).to_contain_text("ego")
 
 
 def test_timeline_zooms_and_marks_frames_by_keys_and_mouse(page: Any) -> None:

@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from sgstore.apps.explorer._plain_words import feature_words, plain_sentence
 from sgstore.base.json_text import finite
 from sgstore.base.processes import send_reply
 from sgstore.errors import StoreError
 from sgstore.exporters import Export, write_export
 from sgstore.model.frame_ids import frame_ids
+from sgstore.model.vocabulary import RELATIONS
 from sgstore.model.world import Clip
 from sgstore.query import Store
 from sgstore.store import MessagePlaces, StateColumns
@@ -44,7 +46,7 @@ MOST_ROWS: Final = 2000
 MOST_PAIRED: Final = 48
 """Number of features in the matrix of missing pairs."""
 
-MOST_IN_WORDS: Final = 60
+MOST_IN_WORDS: Final = 200
 """Number of classes that are described in words."""
 
 
@@ -62,15 +64,15 @@ def coverage(store: Store, what: str, abstraction: str) -> dict[str, Any]:
     if what == "growth":
         return _table(growth(of, "frame", 80))
     if what == "matrix":
-        return features(of, abstraction, of_ego=True).matrix(MOST_PAIRED)
+        found = features(of, abstraction, of_ego=True).matrix(MOST_PAIRED)
+        return {**found, "words": [*map(_in_words, found["names"])]}
     if what == "classes":
         table = classes(of)
         shown = table.column("frame")[:MOST_IN_WORDS]
         return {**_table(table), "words": phrases(store, shown)}
     found = combos(of, abstraction, 2)
-    return {"shares": _table(found.shares), "missing": _table(found.missing)} | {
-        "covered": _table(found.covered)
-    }
+    tables = {"shares": found.shares, "missing": found.missing, "covered": found.covered}
+    return {name: _table(table) for name, table in tables.items()}
 
 
 def select(store: Store, clips: Clips, abstraction: str) -> dict[str, Any]:
@@ -162,5 +164,25 @@ def _apart(clips: Clips) -> list[tuple[str, int, int]]:
 
 def _table(of: ReportTable) -> dict[str, Any]:
     """Return a result table as JSON values for the page, with the total number of rows."""
-    rows = finite(of.rows[:MOST_ROWS])
-    return {"columns": of.columns, "rows": rows, "of": len(of.rows), "said": of.said}
+    of_words = [_WORDS.get(name) for name in of.columns]
+    rows = [
+        [
+            value if words is None else words(value)
+            for words, value in zip(of_words, row, strict=True)
+        ]
+        for row in finite(of.rows[:MOST_ROWS])
+    ]
+    said = [*map(plain_sentence, of.said)]
+    return {"columns": of.columns, "rows": rows, "of": len(of.rows), "said": said}
+
+
+def _in_words(feature: str) -> str:
+    return feature_words(feature, frozenset(RELATIONS))
+
+
+_WORDS: Final = {
+    "combination": _in_words,
+    "measure": plain_sentence,
+    "denominator": plain_sentence,
+}
+"""Column of a table → function that returns its texts in plain words."""

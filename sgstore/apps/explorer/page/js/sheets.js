@@ -19,6 +19,13 @@ function go(name) {
   if (found) openFrame(...found);
 }
 
+/** Words for columns of coverage. @type {Record<string, string>} */
+const HEADS = { class: "kind of scene", classes: "kinds of scenes", new_per_1000: "new per 1,000 frames",
+  at_random: "kinds in random order" };
+
+/** @param {string} name */
+const headOf = (name) => HEADS[name] || name.replace(/_/g, " ");
+
 /** A table; columns that hold nothing are left out. @param {{table: any, most?: number}} props */
 export function Table({ table, most = 200 }) {
   const columns = table.columns.map((/** @type {string} */ name, /** @type {number} */ at) => {
@@ -31,14 +38,16 @@ export function Table({ table, most = 200 }) {
   }).filter((/** @type {any} */ one) => one.known);
   return html`${(table.said || []).map((/** @type {string} */ line) => html`<p class="faint">${line}</p>`)}
     <table><thead><tr>${columns.map((/** @type {any} */ one) => html`<th class=${one.number ? "number" : ""}>
-      ${one.name.replace(/_/g, " ")}</th>`)}</tr></thead><tbody>
-    ${table.rows.slice(0, most).map((/** @type {any[]} */ row) => html`<tr>
+      ${headOf(one.name)}</th>`)}</tr></thead><tbody>
+    ${table.rows.slice(0, most).map((/** @type {any[]} */ row, /** @type {number} */ i) => html`<tr>
       ${columns.map((/** @type {any} */ { name, at, digits }) => {
       const v = row[at];
       if (name === "query") return html`<td>${v ? html`<button class="small"
         onClick=${() => ask(v)}>find</button> <code class="cut" title=${v}>${v}</code>` : ""}</td>`;
       if ((name === "frame" || name === "first") && v) return html`<td>
         <button class="quiet small" onClick=${() => go(v)}>${v}</button></td>`;
+      if (name === "class" && table.words?.[i]) return html`<td title=${`class ${v} of ${abstraction.value}`}>
+        ${table.words[i].replace(/_/g, " ")}</td>`;
       if (name === "class" && String(v).length > 24) return html`<td><code title=${v}>${String(v).slice(0, 12)}</code>
         </td>`;
       if ((name === "share" || name === "cumulative") && typeof v === "number") return html`<td class="number">
@@ -79,7 +88,7 @@ function Chart({ table, x, lines }) {
     { maximumFractionDigits: v < 10 ? 1 : 0 });
   return html`<label class="row"><input type="checkbox" checked=${log}
     onChange=${() => { logarithmic.value = !log; }} /> logarithmic axes</label>
-    <svg class="chart" viewBox="0 0 900 240" role="img" aria-label=${`${lines.join(" and ")} by ${x}, ${log
+    <svg class="chart" viewBox="0 0 900 240" role="img" aria-label=${`${lines.map(headOf).join(" and ")} by ${x}, ${log
       ? "logarithmic" : "linear"} axes`}>
     ${ticksOf(low, top, log).map((v) => html`<line class="axis" x1="56" x2="886" y1=${py(v)} y2=${py(v)} />
       <text class="axis-text" x="50" y=${py(v) + 4} text-anchor="end">${said(v)}</text>`)}
@@ -87,8 +96,8 @@ function Chart({ table, x, lines }) {
       ${said(v)}</text>`)}
     ${all.map((ys, k) => html`<polyline class="series" style=${{ stroke: colours[k] }}
       points=${ys.map((/** @type {number} */ v, /** @type {number} */ i) => `${px(xs[i])},${py(v)}`).join(" ")} />
-      <text x=${56 + k * 110} y="18" font-size="12" font-weight="600" fill=${colours[k]}>
-        ${(lines[k] || "").replace(/_/g, " ")}</text>`)}
+      <text x=${56 + k * 150} y="18" font-size="12" font-weight="600" fill=${colours[k]}>
+        ${headOf(lines[k] || "")}</text>`)}
     <text class="axis-text" x="470" y="236" text-anchor="middle">${x}</text></svg>`;
 }
 
@@ -130,9 +139,11 @@ export function Waiting({ told, children }) {
 export const abstraction = signal("RSV");
 const what = signal("classes");
 
-const TABS = [["classes", "Classes by rank"], ["growth", "Growth"], ["matrix", "Matrix of gaps"],
+const TABS = [["classes", "Kinds of scenes"], ["growth", "Growth"], ["matrix", "Matrix of gaps"],
   ["combos", "Combinations"]];
-const ABSTRACTIONS = ["RSV", "ER", "EL", "E", "junction"];
+/** What scenes of one kind have in common: the name of the abstraction, and words. */
+const ABSTRACTIONS = [["RSV", "objects, their relations and lanes"], ["ER", "objects and their relations"],
+  ["EL", "objects and their lanes"], ["E", "objects"], ["junction", "objects, relations and all lanes of the place"]];
 
 export function Coverage() {
   const told = useWork("api/coverage", { what: what.value, abstraction: abstraction.value });
@@ -140,9 +151,10 @@ export function Coverage() {
       ${TABS.map(([key, name]) => html`<button aria-pressed=${what.value === key}
         class=${what.value === key ? "main" : ""}
         onClick=${() => { what.value = key || ""; }}>${name}</button>`)}
-      <label class="row">abstraction <select value=${abstraction.value}
+      <label class="row">Scenes of one kind have the same <select value=${abstraction.value}
         onChange=${(/** @type {{target: HTMLInputElement}} */ e) => { abstraction.value = e.target.value; }}>
-        ${ABSTRACTIONS.map((one) => html`<option>${one}</option>`)}</select></label></div>
+        ${ABSTRACTIONS.map(([name, words]) => html`<option value=${name}>${words} (${name})</option>`)}</select>
+      </label></div>
     <${Waiting} told=${told}>${covered}</${Waiting}></div>`;
 }
 
@@ -150,7 +162,8 @@ export function Coverage() {
 function covered(found) {
   if (found.names) return html`<${Matrix} found=${found} />`;
   if (found.missing) {
-    return html`<h2>Combinations of two features</h2><${Table} table=${found.shares} /><h2>Missing</h2>
+    return html`<h2>Combinations of two features</h2>
+      <p class="faint">A feature is a fact of a frame, such as: car directly ahead of the ego.</p><${Table} table=${found.shares} /><h2>Missing</h2>
       <p class="faint">Each is a query: what it finds would close the gap.</p><${Table} table=${found.missing} />
       <h2>Covered</h2><${Table} table=${found.covered} />`;
   }
@@ -158,23 +171,25 @@ function covered(found) {
     return html`<h2>Does more data bring more kinds of scenes?</h2>
       <${Chart} table=${found} x="frames" lines=${["classes", "at_random"]} /><${Table} table=${found} />`;
   }
-  return html`<h2>Classes of scenes, the most frequent first</h2>
+  return html`<h2>Kinds of scenes, the most frequent first</h2>
     <${Chart} table=${found} x="rank" lines=${["frames"]} />
     <${Classes} found=${found} /><${Table} table=${found} />`;
 }
 
-/** Classes with a picture of their first frame, and in words. @param {{found: any}} props */
+const CARDS = 60;
+
+/** Kinds of scenes with a picture of their first frame, and in words. @param {{found: any}} props */
 function Classes({ found }) {
-  const rows = found.rows.slice(0, found.words.length);
+  const rows = found.rows.slice(0, CARDS);
   useEffect(() => wantThumbs(rows.flatMap((/** @type {any[]} */ row) => {
     const one = frameNamed(row[5]);
     return one ? [one] : [];
   })), [found]);
-  return html`<div class="cards classes">${rows.map((/** @type {any[]} */ [rank, , frames, share, , frame],
+  return html`<div class="cards classes">${rows.map((/** @type {any[]} */ [rank, code, frames, share, , frame],
     /** @type {number} */ i) => {
     const [trace, seq] = frameNamed(frame) || ["", 0];
-    return html`<button class="card" key=${frame} onClick=${() => go(frame)}>
-      <${Thumb} trace=${trace} frame=${seq} />
+    return html`<button class="card" key=${frame} title=${`class ${code} of ${abstraction.value}`}
+      onClick=${() => go(frame)}><${Thumb} trace=${trace} frame=${seq} />
       <h3>${rank}. <span class="grow"></span><span class="faint">
         ${frames.toLocaleString("en")} frames, ${(share * 100).toFixed(1)} %</span></h3>
       <p>${(found.words[i] || "no entity near the ego").replace(/_/g, " ")}</p></button>`;
@@ -182,8 +197,8 @@ function Classes({ found }) {
 }
 
 /** How often two features are in the same frame; a gap is its query.
- * @param {{found: {names: string[], frames: number[][], queries: Record<string, string>}}} props */
-function Matrix({ found: { names, frames, queries } }) {
+ * @param {{found: {words: string[], frames: number[][], queries: Record<string, string>}}} props */
+function Matrix({ found: { words: names, frames, queries } }) {
   const size = 17, left = 12 + 6.2 * Math.min(42, Math.max(...names.map((name) => name.length)));
   const most = Math.max(...frames.flat(), 1), gaps = Object.keys(queries).length;
   const [at, point] = useState(/** @type {[number, number] | null} */ (null));
@@ -200,9 +215,10 @@ function Matrix({ found: { names, frames, queries } }) {
   }));
   const told = at ? html`<b>${names[at[1]]}</b> with <b>${names[at[0]]}</b>: ${(frames[at[0]]?.[at[1]]
     || 0).toLocaleString("en")} frames` : "point at a cell";
-  if (!names.length) return html`<p class="faint">This abstraction has no relations of the ego.</p>`;
+  if (!names.length) return html`<p class="faint">The objects alone have no relations to the ego: choose another entry
+    above.</p>`;
   return html`<h2>Pairs of features: ${gaps} ${gaps === 1 ? "gap" : "gaps"}</h2>
-    <p class="faint">Each cell is a pair of the most frequent features. A strong colour means many frames.
+    <p class="faint">Each cell is a pair of the most frequent features: facts of a frame, relative to the ego. A strong colour means many frames.
       No frame has the pair of a red cell; click it for its query.</p>
     <p role="status">${told}</p>
     <div class="matrix" tabindex="0"><svg width=${left + names.length * size + 4} height=${names.length * size + 8}
