@@ -619,6 +619,28 @@ def test_matrix_of_gaps_is_that_of_the_features(page: Page, store: Store) -> Non
         assert store.find(query).count() == 0
 
 
+def test_the_last_selection_is_kept_beside_the_store(page: Page, town_store: Path) -> None:
+    file = town_store.with_name("town.sgstore.selection.txt")
+    assert page.get("/api/selection").json() == {"ticks": ""}
+    ticks = "a%2ab*e.v*5.2.0.3_1.0.0.3*_*town**0.1"
+    assert page.post("/api/selection", ticks=ticks).json() == {"file": file.name}
+    assert file.read_text() == ticks
+    assert page.get("/api/selection").json() == {"ticks": ticks}
+    for wrong in ("a b", "<script>", "é", 3, None):
+        assert page.post("/api/selection", ticks=wrong).status_code == 400
+    assert file.read_text() == ticks
+    file.write_bytes(b"\xff" * 20)  # of another program
+    assert page.get("/api/selection").status_code == 400
+    file.unlink()
+
+
+def explorer_files(page: Page) -> Iterator[Path]:
+    """Yield the files beside the store, and in the folder that the page may write to."""
+    for folder in (page.explorer.stores["a"].file.path.parent, page.explorer.write_to):
+        assert folder
+        yield from folder.iterdir()
+
+
 def test_clips_become_a_test_set(page: Page, store: Store) -> None:
     from sgstore.testsets.locks import read_lock, verify
 
@@ -632,6 +654,10 @@ def test_clips_become_a_test_set(page: Page, store: Store) -> None:
     lock = read_lock(made["file"])
     assert [(case.first, case.last) for case in lock.cases] == [(10, 60), (100, 120)]
     assert not list(verify(lock, store))
+    before = {*explorer_files(page)}
+    loaded = result_of(page.post("/api/download", clips=clips).text)
+    assert loaded == {"text": lock.text(), "cases": 2}
+    assert {*explorer_files(page)} == before
 
     files = result_of(page.post("/api/export", clips=clips[1:], name="clips").text)
     assert files["files"]

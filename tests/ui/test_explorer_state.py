@@ -253,13 +253,13 @@ def test_a_selection_is_downloaded_without_write_to(
     assert told.value.suggested_filename == "two words.lock"
     told.value.save_as(tmp_path / "two words.lock")
     expect(page.get_by_text("1 case downloaded")).to_be_visible()
-    page.get_by_label("as", exact=True).select_option("nx")
+    page.locator("select[name=format]").select_option("nx")
     command = shlex.split(page.locator("form + p + p code").inner_text())
     assert command[:2] == ["sgstore", "export"]
     monkeypatch.chdir(tmp_path)
     subprocess.run([sys.executable, "-m", *command], check=True, capture_output=True)
     match = next(iter(Store(town_store).find(f"{NEAR} WHERE e.speed > 3").intervals()))
-    (file,) = (tmp_path / "two words").iterdir()
+    (file,) = (tmp_path / "two words").glob("*.jsonl")
     assert len(file.read_text().splitlines()) == match.end_seq - match.start_seq + 1
     page.get_by_role("button", name="remove all").click()
 
