@@ -5,7 +5,8 @@ import * as api from "./api.js";
 import { frame } from "./clock.js";
 import { placeIn } from "./data.js";
 import {
-  answer, drop, find, isLost, keyOf, matches, notice, open, openFrame, openMatch, parametersOf, playing, reasonOf, refresh, say,
+  answer, drop, find, isLost, keyOf, matches, notice, open, openFrame, openMatch, parametersOf, playing, reasonOf,
+    refresh, say,
     second,
   seq, side, store, text, ticked, traces, values, view,
 } from "./state.js";
@@ -71,8 +72,9 @@ export const offered = signal(/** @type {Map<string, Match>} */ (new Map()));
 
 /** Offer the last selection of the store, and keep each one from now on. What is offered stays part of it. */
 export async function followSelection() {
-  const { ticks: told } = await api.json("api/selection"), left = [...ticksOf(told)].filter(([key, { trace, last }]) => (
-    !ticked.value.has(key) && last < (traces.value.get(trace)?.frames || 0)));
+  const { ticks: told } = await api.json("api/selection");
+  const left = [...ticksOf(told)].filter(([key, { trace, last }]) => !ticked.value.has(key)
+    && last < (traces.value.get(trace)?.frames || 0));
   offered.value = new Map(left);
   let known = told, waits = /** @type {any} */ (0), begun = false, stop = () => {};
   const save = async (/** @type {string} */ ticks) => {

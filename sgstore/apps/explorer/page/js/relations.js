@@ -3,7 +3,8 @@
 
 /** @typedef {{src: number, dst: number, relation: string}} Edge */
 /** @typedef {{id: number, kind: string, name?: string, light_state?: string | null}} Node */
-/** Nodes at an end of a line: what they are called together, and their ids. @typedef {{name: string, ids: number[]}} End */
+/** Nodes at an end of a line: what they are called together, and their ids.
+ * @typedef {{name: string, ids: number[]}} End */
 
 /** Edges as lines. Unbound traffic lights of the same state with the same relation to the same node are one line.
  * @param {Edge[]} edges @param {Node[]} nodes @param {Set<number>} bound nodes that have their own lines
@@ -27,5 +28,5 @@ export function linesOf(edges, nodes, bound) {
     const ids = [...all], [first = 0] = ids;
     return { ids, name: ids.length > 1 ? wordsOf(first) || nameOf(first) : nameOf(first) };
   };
-  return [...lines.values()].map(({ src, relation, dst, count }) => ({ src: end(src), relation, dst: end(dst), count }));
+  return [...lines.values()].map((line) => ({ ...line, src: end(line.src), dst: end(line.dst) }));
 }

@@ -163,7 +163,8 @@ function covered(found) {
   if (found.names) return html`<${Matrix} found=${found} />`;
   if (found.missing) {
     return html`<h2>Combinations of two features</h2>
-      <p class="faint">A feature is a fact of a frame, such as: car directly ahead of the ego.</p><${Table} table=${found.shares} /><h2>Missing</h2>
+      <p class="faint">A feature is a fact of a frame, such as: car directly ahead of the ego.</p>
+      <${Table} table=${found.shares} /><h2>Missing</h2>
       <p class="faint">Each is a query: what it finds would close the gap.</p><${Table} table=${found.missing} />
       <h2>Covered</h2><${Table} table=${found.covered} />`;
   }
@@ -218,7 +219,8 @@ function Matrix({ found: { words: names, frames, queries } }) {
   if (!names.length) return html`<p class="faint">The objects alone have no relations to the ego: choose another entry
     above.</p>`;
   return html`<h2>Pairs of features: ${gaps} ${gaps === 1 ? "gap" : "gaps"}</h2>
-    <p class="faint">Each cell is a pair of the most frequent features: facts of a frame, relative to the ego. A strong colour means many frames.
+    <p class="faint">Each cell is a pair of the most frequent features: facts of a frame, relative to the ego.
+      A strong colour means many frames.
       No frame has the pair of a red cell; click it for its query.</p>
     <p role="status">${told}</p>
     <div class="matrix" tabindex="0"><svg width=${left + names.length * size + 4} height=${names.length * size + 8}
