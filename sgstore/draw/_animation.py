@@ -45,7 +45,7 @@ FILM_CHANGE: Final = 40
 
 
 class Animation(ABC):
-    """Writer of an animation file, picture by picture; a context manager.
+    """Writer of an animation file; a context manager. Its pictures are added one by one.
 
     Parameters
     ----------
@@ -158,7 +158,7 @@ class Gif(Animation):
         self.frames += 1
 
     def _indexed(self, picture: Image.Image, box: tuple[int, int, int, int]) -> Image.Image:
-        """Return part of a picture in the palette of an earlier picture, or with new colours."""
+        """Return part of a picture with indexed colours. Use the earlier palette if it fits, else a new one."""
         if self._palette is not None:
             part = picture.crop(box)
             made = part.quantize(palette=self._palette, dither=Image.Dither.NONE)
@@ -253,7 +253,7 @@ class Video(Animation):
 
 
 def changed(before: Pixels | None, now: Pixels) -> tuple[int, int, int, int]:
-    """Return the rectangle (left, top, right, bottom) in which two pictures differ; at least one pixel."""
+    """Return the smallest rectangle that contains all differences of two pictures, at least one pixel."""
     height, width, _ = now.shape
     if before is None:
         return 0, 0, width, height

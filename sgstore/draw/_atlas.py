@@ -137,7 +137,7 @@ def _paint_names(stage: Stage, ground: GroundView, reserved: Iterable[Rect]) -> 
 
 
 def _middles(ground: GroundView, rows: list[int], names: tuple[str, ...]) -> dict[str, Floats]:
-    """Return for each road or junction the mean position of its lanes, in picture coordinates."""
+    """For each road or junction, return the mean position of its lanes, in picture coordinates."""
     grouped: dict[str, list[int]] = {}
     for row in rows:
         grouped.setdefault(names[row], []).append(row)

@@ -72,7 +72,7 @@ def _page(
 def _chart(
     to: Path, title: str, below: str, names: tuple[str, str], right: float = _RIGHT
 ) -> Generator[Axes]:
-    """Yield the axes of a chart that fills a page, with axis titles, and write the page at the end."""
+    """Yield the axes of a chart on a new page, with axis titles. At the end, write the page to a file."""
     with _page(to, title, below) as page:
         axes = page.plot(_LEFT, _BELOW, page.width - right, page.height - _ABOVE)
         axes.set_xlabel(names[0], fontsize=8, color=INK, parse_math=False)
@@ -168,7 +168,7 @@ def draw_growth(
     title: str,
     below: str = "",
 ) -> None:
-    """Draw a chart of the number of scene classes in the first n frames, and in n random frames.
+    """Draw a chart: the number of scene classes in the first n frames, and in n randomly chosen frames.
 
     Parameters
     ----------
@@ -206,7 +206,7 @@ def draw_matrix(
     groups: Sequence[str] = (),
     most: int = MOST_FEATURES,
 ) -> None:
-    """Draw a matrix of feature pairs: the number of frames with both features, and missing pairs.
+    """Draw a matrix of feature pairs: the number of frames in which both occur, and the missing pairs.
 
     Each pair has one place, below the diagonal.
 
@@ -291,7 +291,7 @@ def draw_matrix(
 def _most_surprising(
     shown: NDArray[np.int64], frames: NDArray[np.int64], gaps: NDArray[np.bool_], most: int
 ) -> NDArray[np.int64]:
-    """Return the features with the most unexpected missing pairs: pairs of features that occur often."""
+    """Return the features with the most surprising missing pairs, in which both features are frequent."""
     often = np.diagonal(frames) + 1.0
     surprise = (gaps[np.ix_(shown, shown)] * often[shown]).sum(axis=1) * often[shown]
     return np.sort(shown[np.argsort(-surprise, kind="stable")[:most]])
@@ -303,7 +303,7 @@ def _cells(
     wanted: NDArray[np.bool_],
     groups: Sequence[str],
 ) -> NDArray[np.float64]:
-    """Return the cell colours below the diagonal. Pairs of one slot are white, other impossible pairs grey."""
+    """Return the colours of a matrix of pairs. Pairs within a group are white, other impossible pairs grey."""
     from matplotlib.colors import to_rgb
 
     image = _colours(frames, gaps)
@@ -321,7 +321,7 @@ _LARGEST_CELL: Final = 24.0
 
 
 def _compared(groups: Sequence[str], count: int) -> tuple[slice, slice]:
-    """Return the rows and columns that have pairs: all of them, or without the first or the last slot."""
+    """Return the row range and the column range of a matrix of pairs, without empty rows and columns."""
     if len({*groups}) < 2:
         return slice(count), slice(count)
     return slice(groups.count(groups[0]), count), slice(count - groups.count(groups[-1]))
@@ -330,7 +330,7 @@ def _compared(groups: Sequence[str], count: int) -> tuple[slice, slice]:
 def _one_direction(
     names: Sequence[str], frames: NDArray[np.int64], wanted: NDArray[np.bool_]
 ) -> NDArray[np.intp]:
-    """Return indices of features. Of several features that occur in the same frames, only one is included."""
+    """Return indices of features. Of features that occur in exactly the same frames, only one is returned."""
     order = np.array(
         sorted(range(len(names)), key=lambda i: not names[i].startswith("ego ")), np.intp
     )
@@ -340,7 +340,7 @@ def _one_direction(
 
 
 def _colours(frames: NDArray[np.int64], gaps: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the cell colours (F, F, 3) of a matrix of feature pairs.
+    """Return the cell colours of a matrix of feature pairs, (F, F, 3) for F features.
 
     A cell is darker for more frames, and orange for a missing pair.
     """

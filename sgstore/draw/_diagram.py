@@ -1,4 +1,4 @@
-"""Diagram of a scene graph (nodes and edges): selection of its content, layout and style.
+"""Diagram of a scene graph as nodes and edges: choice of the content, layout and drawing.
 
 The first part selects the nodes and edges of a diagram, and the edges that share a line.
 
@@ -49,7 +49,7 @@ _TIERS: Final[dict[str, Tier]] = {"road": "road", "junction": "junction", "round
 
 @dataclass(frozen=True, slots=True)
 class DiagramLine:
-    """Edges between two nodes of a scene graph, drawn as one line with an arrow from ``a`` to ``b``.
+    """Line of a diagram: all edges between two nodes ``a`` and ``b``. An arrow points from ``a`` to ``b``.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class DiagramLine:
 
     @property
     def text(self) -> str:
-        """Return the text on a line of a diagram; empty if the colour and style of the line are enough."""
+        """Return the text on a line of a diagram; empty if the style of the line is enough."""
         if self.family in {"isIn", "part", "light"}:
             return ""
         there, back = (", ".join(words[:MOST_WORDS]) for words in (self.relations, self.back))
@@ -81,7 +81,7 @@ class DiagramLine:
 def excerpt_of(
     graph: SceneGraph, matched: frozenset[int], relations: Relations
 ) -> tuple[dict[int, Tier], list[DiagramLine]]:
-    """Return the nodes and lines of a scene graph that a diagram shows.
+    """Select the nodes and lines of a scene graph that a diagram shows.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ def _entities(graph: SceneGraph, matched: frozenset[int], relations: Relations) 
 
 
 def _close(graph: SceneGraph) -> set[int]:
-    """Return the entities with a proximity relation to the ego.
+    """Return the entities that are near the ego according to a relation of the scene graph.
 
     In a graph without proximity relations, any relation counts.
     """
@@ -154,7 +154,7 @@ def _close(graph: SceneGraph) -> set[int]:
 def _lanes(
     graph: SceneGraph, entities: list[int], matched: frozenset[int]
 ) -> tuple[list[int], list[int]]:
-    """Return the primary lanes of entities, and the other map parts of the entities, such as crosswalks."""
+    """Return the lanes of entities and of matches, and the crosswalks and off-road areas of entities."""
     within: dict[int, list[tuple[bool, int]]] = {}
     other: list[int] = []
     wanted = set(entities)
@@ -185,7 +185,7 @@ def _lights(graph: SceneGraph, lanes: list[int], matched: frozenset[int]) -> lis
 
 
 def _parts(graph: SceneGraph, lanes: list[int]) -> list[int]:
-    """Return the roads and junctions that contain some lanes."""
+    """Return the roads and junctions that contain the given lanes."""
     inside: dict[int, list[int]] = {}
     for src, relation, dst, _ in graph.edges:
         if relation == "isIn" and src < 0 and dst in graph.nodes:
@@ -216,7 +216,7 @@ def _lines(
 
 
 def _together(a: Tier, b: Tier, matched: bool) -> Family | None:  # noqa: FBT001
-    """Return the family of relations that is drawn as one line for both directions between two nodes.
+    """Return ``map`` or ``matched`` if one line shows the edges of both directions between two nodes.
 
     ``None`` means that each direction has its own line.
     """
@@ -259,7 +259,7 @@ _PULL: Final = 0.06
 
 
 def scattered(places: Floats, sizes: Floats, box: Rect, *, pinned: int = 1) -> Floats:
-    """Return places for the nodes of a diagram, near their real positions and without overlaps.
+    """Return positions for the nodes of a diagram, near their real positions and without overlaps.
 
     Parameters
     ----------
@@ -295,7 +295,7 @@ def scattered(places: Floats, sizes: Floats, box: Rect, *, pinned: int = 1) -> F
 
 
 def _apart(wanted: Floats, sizes: Floats, box: Rect, pinned: int) -> Floats:
-    """Return node places in which overlapping nodes are pushed apart, but stay near their real positions."""
+    """Push overlapping nodes apart, but keep them near their real positions; return the new positions."""
     count = len(wanted)
     low = np.array(box[:2]) + sizes / 2
     high = np.array(box[2:]) - sizes / 2
@@ -323,7 +323,7 @@ def _apart(wanted: Floats, sizes: Floats, box: Rect, pinned: int) -> Floats:
 
 
 def _freed(spots: Floats, sizes: Floats, box: Rect, pinned: int) -> Floats:
-    """Return node places in which each overlapping node is moved to the nearest free place, if any."""
+    """Move each node that still overlaps to the nearest free position, if any; return the new positions."""
     low, high = np.array(box[:2]), np.array(box[2:])
     spots = spots.copy()
     for node in range(pinned, len(spots)):
@@ -343,7 +343,7 @@ def _freed(spots: Floats, sizes: Floats, box: Rect, pinned: int) -> Floats:
 
 
 def rows(order: Floats, widths: Floats, box: Rect) -> tuple[Floats, int]:
-    """Return places for nodes side by side in rows, ordered from left to right, and the number of rows.
+    """Arrange nodes in rows, from left to right; return their positions and the number of rows.
 
     Parameters
     ----------
@@ -449,7 +449,7 @@ def diagram_entries() -> list[Entry]:
 
 
 class _Diagram:
-    """Diagram of a scene graph in a window, with a place for each node."""
+    """Diagram of a scene graph in a window. It computes a position for each node."""
 
     def __init__(
         self,
@@ -475,7 +475,7 @@ class _Diagram:
             self._placer.block((left - 2, bottom - 2, right + 2, top + 2))
 
     def paint(self) -> int:
-        """Draw the nodes, lines and texts. Return the number of lines that had no space for their text."""
+        """Draw the nodes, lines and texts. Return the number of lines whose text did not fit."""
         for line in self._lines:
             self._paint_line(line)
         # The most important line is written first.
@@ -485,7 +485,7 @@ class _Diagram:
         return written.count(False)
 
     def _placed(self, tiers: dict[int, Tier]) -> dict[int, Point]:
-        """Return the place of each node by tier: junctions at the bottom, then roads, lanes and entities."""
+        """Return the positions of all nodes. From the bottom up: junctions, roads, lanes, entities."""
         left, bottom, right, top = self._box
         floor = bottom + 6
         spots: dict[int, Point] = {}
@@ -509,7 +509,7 @@ class _Diagram:
         return spots | {n: (x, y) for n, (x, y) in zip(nodes, found.tolist(), strict=True)}
 
     def _aside(self, node: int) -> float:
-        """Return the distance in metres of a map part to the right of the ego, at its nearest point."""
+        """Return how far a map part lies to the right of the ego, at a point of the part near the ego; m."""
         ground = self._scene.ground
         if ground is not None:
             near = ground.nearest(node, (0.0, 4.0))
@@ -581,7 +581,7 @@ class _Diagram:
         return (1 - t) ** 2 * start + 2 * t * (1 - t) * control + t**2 * end
 
     def _paint_words(self, line: DiagramLine) -> bool:
-        """Write the text of a line where few other lines are. Return False without space for the text."""
+        """Write the text of a line where few other lines are. Return False if the text does not fit."""
         text = line.text
         if not text or line.family == "entity":
             return True

@@ -62,13 +62,13 @@ class DrawnLink:
 
     @property
     def closeness(self) -> str | None:
-        """Return the closest proximity relation between the two nodes of a line, or ``None``."""
+        """Return the closest proximity relation between the two nodes of a line; ``None`` if they have none."""
         close = [r for r in (*self.there, *self.back) if r in RANK]
         return min(close, key=RANK.__getitem__, default=None)
 
 
 def links_of(graph: SceneGraph, matched: frozenset[int], relations: Relations) -> list[DrawnLink]:
-    """Return the lines to draw between nodes: faint lines first, those of matched nodes last.
+    """Return the lines to draw between nodes: first the faint ones, last the lines of matched nodes.
 
     ``ego``: the ego's proximity to all except scenery (its other relations, if the graph has no
     proximity), signals that control the ego's lane, and every edge among matched nodes. ``all``:
@@ -105,7 +105,7 @@ def _quiet_family(a: object, b: object) -> Family:
 
 
 def ego_lane(graph: SceneGraph) -> int | None:
-    """Return the node of the ego's primary lane, or ``None``."""
+    """Return the lane node in which the ego mainly is; ``None`` if it is in no lane."""
     lanes = [
         (not attributes.get("is_primary", False), dst)
         for src, relation, dst, attributes in graph.edges
@@ -117,7 +117,7 @@ def ego_lane(graph: SceneGraph) -> int | None:
 
 
 def seen_from_ego(graph: SceneGraph) -> dict[int, tuple[str, ...]]:
-    """Return the relations of each entity to the ego, with the most informative relation first."""
+    """For each entity, return its relations to the ego, the most informative relation first."""
     if graph.ego is None:
         return {}
     return {
@@ -128,14 +128,14 @@ def seen_from_ego(graph: SceneGraph) -> dict[int, tuple[str, ...]]:
 
 
 def sentences(link: DrawnLink, names: Mapping[int, str]) -> list[str]:
-    """Return the relations between two nodes as texts with node names, such as ``p near, inDFrontOf v``."""
+    """Return the relations between two nodes as texts with the nodes' names, such as ``car 3 near car 7``."""
     a, b = (clean(names.get(node) or node, 16) for node in (link.a, link.b))
     there = [f"{b} {', '.join(link.there)} {a}"] if link.there else []
     return there + ([f"{a} {', '.join(link.back)} {b}"] if link.back else [])
 
 
 def linked(graph: SceneGraph) -> dict[tuple[int, int], tuple[tuple[str, ...], tuple[str, ...]]]:
-    """Return the sorted relations of each pair of nodes ``(a, b)``, in both directions.
+    """For each pair of connected nodes ``(a, b)``, return its relations from b to a, and from a to b.
 
     The ego is ``a``. The most informative relations are first.
     """
@@ -146,7 +146,7 @@ def linked(graph: SceneGraph) -> dict[tuple[int, int], tuple[tuple[str, ...], tu
 
 
 def _pairs(graph: SceneGraph) -> dict[tuple[int, int], tuple[list[str], list[str]]]:
-    """Return the relations of each pair of nodes ``(a, b)``: from b to a, and from a to b."""
+    """For each pair of connected nodes ``(a, b)``, return its relations from b to a, and from a to b."""
     pairs: dict[tuple[int, int], tuple[list[str], list[str]]] = {}
     for src, relation, dst, _ in graph.edges:
         if src == dst or src not in graph.nodes or dst not in graph.nodes:

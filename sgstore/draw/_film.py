@@ -43,7 +43,7 @@ _AS_THEY_ARE = np.empty((0, 3, 3))
 
 
 class FilmPage(Page):
-    """Page for the pictures of an animation; the caller clears it before each picture."""
+    """Page for the pictures of an animation. The caller clears the page before each picture."""
 
     def __init__(self, width: float, height: float, dpi: float) -> None:
         self._windows: dict[Rect, Axes] = {}
@@ -86,7 +86,7 @@ class FilmPage(Page):
         return pixels
 
     def add(self, axes: Axes, artist: Artist) -> None:
-        """Draw a matplotlib object on the page or in a window of it, in the units of that window."""
+        """Draw a matplotlib object on the page or in one of its windows, in units of that page or window."""
         artist.set_figure(self._figure)
         artist.axes = axes
         if not artist.is_transform_set():
@@ -114,7 +114,7 @@ class FilmPage(Page):
         )
 
     def write(self, axes: Axes, x: float, y: float, text: str, **look: Any) -> None:
-        """Write a text on the page or in a window of it, in the units of that window."""
+        """Write a text on the page or in one of its windows, in units of that page or window."""
         style = TEXT | look
         style.pop("gid", None)
         text = printable(text)
@@ -204,7 +204,7 @@ class FilmPage(Page):
         return self._pens[key]
 
     def _has_room(self, outline: Outline, scale: Affine2D) -> bool:
-        """True if an outline is small enough for the page, so that matplotlib can draw it as a marker."""
+        """True if an outline is smaller than the page, so that matplotlib can draw it as a marker."""
         extents, page = outline.get_extents(scale), self._figure.bbox
         return extents.width < page.width and extents.height < page.height
 
@@ -228,7 +228,7 @@ class TextSprites:
         self._renderer: Any = RendererAgg(1, 1, dpi)
 
     def drawn(self, text: str, width: float, style: dict[str, Any]) -> Sprite:
-        """Return a text with its background as pixels. ``width`` is its width in pixels."""
+        """Draw a text with its background, and return it as pixels. ``width`` is its width in pixels."""
         around = 3 * style["fontsize"] * self._dpi / 72
         x, y = math.ceil(width + around), math.ceil(around)
         if 2 * x > self._renderer.width or 2 * y > self._renderer.height:
@@ -251,7 +251,7 @@ class TextSprites:
 
 
 def _dashes(linestyle: Any, width: float) -> tuple[float, list[float] | None]:
-    """Return the offset of a dashed line, and the lengths of its dashes and gaps in pixels.
+    """Return the offset of a pattern of dashes, and the lengths of the dashes and gaps; pixels.
 
     ``None`` means a solid line.
     """

@@ -78,7 +78,7 @@ class GroundView:
         ]
 
     def storeys(self) -> dict[int, int]:
-        """Return the storey of each visible lane, by node index, from 0 for the lowest."""
+        """Return the level of each visible lane, by node index. Level 0 is the lowest; bridges are higher."""
         rows = self.of_kind("lane")
         z = self.nodes.z[rows]
         low, high = np.nanmin(z, initial=np.inf), np.nanmax(z, initial=-np.inf)
@@ -87,7 +87,7 @@ class GroundView:
         return dict(zip(rows, levels.tolist(), strict=True))
 
     def cover(self, places: Floats, z: Floats) -> Floats:
-        """Return the height in metres of the highest lane relative to each of some points (N, 2).
+        """For each point (N, 2) with height ``z``, return how far the highest lane at the point is above it; m.
 
         The value is -inf where there is no lane.
 
@@ -112,7 +112,7 @@ class GroundView:
         return found
 
     def outline(self, row: int) -> Outline | None:
-        """Return the outline of a map node in picture coordinates. ``None`` means a node without an area."""
+        """If a map node has an area, return its outline in picture coordinates; otherwise ``None``."""
         known = _SHAPES.setdefault(self.road_map, {})
         shape = self.outlines[row]
         if row not in known or known[row][0] is not shape:
@@ -136,7 +136,7 @@ class GroundView:
         return [o for row in rows if (o := self.outline(row)) is not None]
 
     def parts(self, node: int) -> list[int]:
-        """Return the indices of the map nodes with the outlines of a node: itself, or the lanes of a road."""
+        """Return the map nodes to draw for a node: the lanes of a road or junction, or only the node itself."""
         row = -1 - node
         if not 0 <= row < len(self.outlines):
             return []
@@ -151,7 +151,7 @@ class GroundView:
         return [row] if self.outlines[row] is not None else []
 
     def sides(self, row: int) -> tuple[Floats, Floats] | None:
-        """Return the left and right border of a lane in its direction of travel, each (N, 2).
+        """Return the left and right border of a lane in its direction of travel; two arrays (N, 2).
 
         ``None`` for other nodes.
         """
@@ -178,7 +178,7 @@ class GroundView:
         return np.concatenate(points) if points else np.empty((0, 2))
 
     def spot(self, node: int) -> tuple[float, float] | None:
-        """Return a visible point of a map part for its name; ``None`` without such a point.
+        """Return a visible point of a map part at which to write its name; ``None`` if the part is not visible.
 
         On a lane it is on the middle line, if possible at least 8 m from the middle of the picture.
         """
@@ -188,7 +188,7 @@ class GroundView:
         return _point(points, np.where(away >= 8.0, away, 1e6 - away))
 
     def nearest(self, node: int, to: tuple[float, float]) -> tuple[float, float] | None:
-        """Return the point on the middle line of a map part that is nearest to a place."""
+        """Return the point on the middle line of a map part that is nearest to a given point."""
         points = self.middles(node)
         return _point(points, np.hypot(*(points - to).T))
 
@@ -237,7 +237,7 @@ def _paint_lanes(
 
 
 def tint(stage: Stage, ground: GroundView, node: int, colour: str, alpha: float) -> None:
-    """Draw a transparent colour over a map part. In an SVG file, the shape gets the id of the node."""
+    """Colour a map part with a transparent colour. In an SVG file, the shape gets the id of the node."""
     parts = ground.parts(node)
     outlines, gid = ground.outlines_of(parts), f"node-{node}"
     if outlines:
@@ -271,7 +271,7 @@ def _is_closed(ring: Floats) -> bool:
 
 
 def _chevrons(line: Floats) -> list[Floats]:
-    """Return evenly spaced arrow heads along a line, as lines; empty for a short line."""
+    """Return arrow heads at equal distances along a line; each is a line. A short line has none."""
     steps = np.hypot(*np.diff(line, axis=0).T)
     along = np.concatenate(((0.0,), np.cumsum(steps)))
     count = round(along[-1] / DrawnOutlines.ARROW_SPACING)
@@ -309,7 +309,7 @@ def _stripes(ground: GroundView, row: int) -> list[Outline]:
 
 
 def _point(points: Floats, cost: Floats) -> tuple[float, float] | None:
-    """Return the point with the lowest cost; ``None`` without points."""
+    """Return the point with the lowest cost; ``None`` if the list of points is empty."""
     if not len(points):
         return None
     x, y = points[cost.argmin()].tolist()
@@ -329,7 +329,7 @@ _SMALL: Final = {"fontsize": 6.5, "ha": "center"}
 
 
 def paint_rings(stage: Stage) -> list[Rect]:
-    """Draw faint distance circles around the middle of the picture; return the rectangles of their labels."""
+    """Draw circles at some distances from the middle of the picture. Return the rectangles of their labels."""
     taken: list[Rect] = []
     for metres in (10, 25, 50, 100, 200):
         if metres > stage.view.radius * 1.05:

@@ -57,7 +57,7 @@ class Entry:
 
 
 def entries_of(scene: DrawnFrame, half: tuple[float, float]) -> list[Entry]:
-    """Return the legend entries for a frame, in a window with half width and half height ``half`` in metres."""
+    """Return the legend entries for a frame. ``half`` is half the width and height of the window; m."""
     bodies = [b for b in scene.bodies.values() if abs(b.x) <= half[0] and abs(b.y) <= half[1]]
     kinds = {b.kind for b in bodies if not b.is_ego}
     entries = [Entry("box", "ego", palette.EGO)] if any(b.is_ego for b in bodies) else []

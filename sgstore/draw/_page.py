@@ -72,7 +72,7 @@ LEARNED: Final = 2_000_000
 
 
 def quantized(picture: Image.Image) -> Image.Image:
-    """Convert an RGB picture to an indexed one of at most 256 colours, chosen from rows of a large picture."""
+    """Reduce an RGB picture to 256 colours. The palette of a large picture is derived from some rows only."""
     plain, every = Image.Dither.NONE, -(-picture.width * picture.height // LEARNED)
     sample = Image.fromarray(np.asarray(picture)[::every]) if every > 1 else picture
     made = sample.quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=100_000, dither=plain)
@@ -80,7 +80,7 @@ def quantized(picture: Image.Image) -> Image.Image:
 
 
 def greatest_change(made: Image.Image, picture: Image.Image) -> int:
-    """Return the greatest change of a colour channel by a palette, 0 … 255."""
+    """Return the greatest difference of a colour channel between two pictures, 0 to 255."""
     return int(np.asarray(ImageChops.difference(picture, made.convert("RGB"))).max())
 
 
@@ -165,7 +165,7 @@ class Stage:
         return 1.0 / self.points
 
     def rect(self, half_x: float, half_y: float, middle: tuple[float, float]) -> Rect:
-        """Return a rectangle of the map window in points from the middle of the window."""
+        """Convert a rectangle of the map window from metres to points (1/72 inch)."""
         (x, y), scale = middle, self.points
         return (
             (x - half_x) * scale,
@@ -255,7 +255,7 @@ class Page:
         return stage
 
     def add(self, axes: Axes, artist: Artist) -> None:
-        """Draw a matplotlib object on the page or in a window of it, in the units of that window."""
+        """Draw a matplotlib object on the page or in one of its windows, in units of that page or window."""
         axes.add_artist(artist)
 
     def fill(
@@ -275,7 +275,7 @@ class Page:
         self.add(axes, PathCollection(outlines, zorder=z, **each, **rest))
 
     def once(self, key: Hashable, box: Rect, paint: Callable[[], None]) -> None:
-        """Draw content in a free rectangle of the page. Content with the same key is equal in all pictures.
+        """Draw content in a rectangle of the page. The same ``key`` means the same content in each picture.
 
         A reusable page paints it only once.
         """
@@ -290,7 +290,7 @@ class Page:
         self.write(self.sheet, x, y, text, **look)
 
     def write(self, axes: Axes, x: float, y: float, text: str, **look: Any) -> None:
-        """Write a text on the page or in a window of it, in the units of that window."""
+        """Write a text on the page or in one of its windows, in units of that page or window."""
         gid = look.pop("gid", None)
         axes.text(x, y, printable(text), parse_math=False, **(TEXT | look)).set_gid(gid)
 
@@ -300,7 +300,7 @@ class Page:
         return width * 72 / self._dpi, height * 72 / self._dpi
 
     def plot(self, left: float, bottom: float, right: float, top: float) -> Axes:
-        """Return the axes of a chart in a rectangle of the page, given in points without axis labels."""
+        """Add the axes of a chart to the page. The rectangle, in points, does not include axis labels."""
         box = (left, bottom, right - left, top - bottom)
         axes = self._figure.add_axes(self._share(*box))
         axes.spines[["top", "right"]].set_visible(False)
@@ -311,7 +311,7 @@ class Page:
         return axes
 
     def legend(self, handles: list[Any], at: tuple[float, float], loc: str, **look: Any) -> None:
-        """Draw a legend for matplotlib objects on the page; its corner ``loc`` is at the point ``at``."""
+        """Draw a legend for matplotlib objects; its corner ``loc`` is at the point ``at`` of the page."""
         style: dict[str, Any] = {
             "ncols": 3,
             "labelcolor": INK,

@@ -36,7 +36,7 @@ _LEFT_OUT: Final = "… and {} more"
 
 @dataclass(slots=True)
 class Panel:
-    """Column next to a picture that is filled with text from its top.
+    """Column next to a picture. Text fills it from the top down.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class Panel:
         self.y -= 3
 
     def row(self, *cells: tuple[float, str], **look: Any) -> None:
-        """Write a row of texts into the panel, each at its distance from the left; long texts are shortened."""
+        """Write several texts in one row of the panel, each at a given offset. Long texts are cut."""
         self.y -= ROW
         ends = [x for x, _ in cells[1:]] + [self.right - self.left + 4]
         style = {"fontsize": _SMALL, **look}
@@ -74,7 +74,7 @@ class Panel:
             self.page.text(self.left + x, self.y + 2, self._cut(text, end - x - 4), **style)
 
     def _cut(self, text: str, width: float) -> str:
-        """Return a text cut to a width in points, because names of traces can be long."""
+        """Return a text cut to a width in points. Names of traces, for example, can be too long."""
         if self.page.text_size(text, _SMALL)[0] <= width:
             return text
         while len(text) > 1 and self.page.text_size(text + "…", _SMALL)[0] > width:
@@ -105,7 +105,7 @@ def paint_matches(panel: Panel, scene: DrawnFrame) -> None:
 
 
 def paint_surroundings(panel: Panel, scene: DrawnFrame, bottom: float) -> None:
-    """Write the neighbours of the ego into the panel, nearest first, as far as there is room."""
+    """Write the neighbours of the ego into the panel, nearest first, until the panel is full."""
     graph = scene.graph
     if graph.ego is None or graph.ego not in graph.nodes:
         return

@@ -29,7 +29,7 @@ _CLEAR: Final = 4.0
 
 
 class Placer:
-    """Occupied places of a picture, to find free places for texts.
+    """Occupied areas of a picture. It finds free places for texts.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ class Placer:
         self._things: list[Rect] = []
 
     def stand(self, x: float, y: float, reach: tuple[float, float]) -> None:
-        """Record the place of an object, so that the names of other objects are not put next to it."""
+        """Mark the position of an object, so that other objects' names are written elsewhere."""
         self._things.append(_around(x, y, reach))
 
     def block(self, rect: Rect) -> None:
@@ -53,7 +53,7 @@ class Placer:
     def beside(
         self, x: float, y: float, reach: tuple[float, float], size: tuple[float, float]
     ) -> tuple[float, float] | None:
-        """Reserve the nearest free place for a text at an object; return the middle of the place.
+        """Reserve the nearest free place for a text beside an object; return the middle of that place.
 
         Parameters
         ----------
@@ -74,7 +74,7 @@ class Placer:
     def named(
         self, x: float, y: float, reach: tuple[float, float], size: tuple[float, float]
     ) -> tuple[tuple[float, float], bool] | None:
-        """Reserve a place for an object's name. Return its middle, and True if it clearly belongs to it.
+        """Reserve a place for an object's name. Return its middle, and True if no other object is as near.
 
         The flag is true if no other object is as near to the name.
 
@@ -106,7 +106,7 @@ class Placer:
     def first_free(
         self, spots: list[tuple[float, float]], size: tuple[float, float]
     ) -> tuple[float, float] | None:
-        """Reserve the first free place for a text. Return its middle, or ``None`` if all are occupied."""
+        """Reserve the first free place for a text. Return its middle, or ``None`` if no place is free."""
         middles = np.array(spots)
         half = np.array(size) / 2
         low, high = middles - half, middles + half
@@ -143,7 +143,7 @@ def _around(x: float, y: float, reach: tuple[float, float]) -> Rect:
 
 
 def _gaps(one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the distances (n, m) between rectangles (n, 4) and (m, 4); 0 for overlapping ones."""
+    """Return the distances (n, m) from n rectangles to m rectangles; 0 if two rectangles overlap."""
     apart = np.maximum(one[:, None, :2] - other[:, 2:], other[:, :2] - one[:, None, 2:])
     return np.hypot(*np.moveaxis(np.maximum(apart, 0.0), -1, 0))
 

@@ -49,7 +49,7 @@ _CLEAR: Final = 15.0
 
 
 def paint_texts(stage: Stage, scene: DrawnFrame, reserved: Iterable[Rect]) -> int:
-    """Write names of nodes and relations into a picture, important ones first. Return the number left out.
+    """Write names of nodes and relations into a picture, important ones first. Return how many did not fit.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ def _is_named(body: Body) -> bool:
 
 
 def _room(stage: Stage, body: Body) -> list[Rect]:
-    """Return the area of an entity's symbol and arrow as small squares, which texts must not cover."""
+    """Return rectangles that cover the symbol and the arrow of an entity, so that no text hides them."""
     half_x, half_y = half_extents(stage, body)
     taken = [stage.rect(half_x * stage.metre, half_y * stage.metre, (body.x, body.y))]
     way = velocity_arrow(body)
@@ -242,7 +242,7 @@ class DrawnFrame:
         return cls(graph, matched, view, {b.node: b for b in bodies}, lost, links, ground)
 
     def place(self, node: int) -> Point | None:
-        """Return the place of a node in the picture; ``None`` means an unknown position."""
+        """Return the position of a node in the picture; ``None`` if it is unknown."""
         if node in self.bodies:
             return self.bodies[node].x, self.bodies[node].y
         place = place_of(self.graph.nodes.get(node, {}))
@@ -252,12 +252,12 @@ class DrawnFrame:
         return x, y
 
     def anchor(self, node: int) -> Point:
-        """Return the point for the name of a node. For a lane, it is a near visible point."""
+        """Return the point at which the name of a node is written. For a lane, this point is visible."""
         spot = self.ground.spot(node) if self.ground is not None and node < 0 else None
         return spot or self.place(node) or (0.0, 0.0)
 
     def ends(self, link: DrawnLink) -> tuple[Point, Point] | None:
-        """Return both ends of a line between two nodes; ``None`` if a node has no place.
+        """Return both ends of the line between two nodes; ``None`` if the position of a node is unknown.
 
         Between an entity and a lane it is the shortest line. Between matched map parts it is away
         from entities, to avoid confusion with their lines.
@@ -273,7 +273,7 @@ class DrawnFrame:
         return None if a is None or b is None else (a, b)
 
     def _beside_one_another(self, link: DrawnLink) -> tuple[Point, Point] | None:
-        """Return both ends of a line between two map parts, far from entities; ``None`` without such a line."""
+        """Return both ends of a line between two map parts, away from entities; ``None`` if impossible."""
         ground = self.ground
         if ground is None or link.a in self.bodies or link.b in self.bodies:
             return None
@@ -308,7 +308,7 @@ class DrawnFrame:
         return [node for node in self.matched if self.is_shown(node)] + also
 
     def is_shown(self, node: int) -> bool:
-        """True if a node has a visible place in the picture."""
+        """True if the position of a node is visible in the picture."""
         place = (
             self.ground.spot(node) if self.has_outline(node) and self.ground else self.place(node)
         )
@@ -320,7 +320,7 @@ class DrawnFrame:
 
 
 def _with_storeys(graph: SceneGraph, bodies: list[Body], ground: GroundView | None) -> list[Body]:
-    """Return the entities with their depth below a road that is drawn above them; m.
+    """Return the entities. If a road is drawn above an entity, add the entity's depth below the road; m.
 
     Without a map the reference is the ego: a body a storey deeper than the ego, beyond a slope.
     """
@@ -342,7 +342,7 @@ def _with_storeys(graph: SceneGraph, bodies: list[Body], ground: GroundView | No
 
 
 def paint_scene(stage: Stage, scene: DrawnFrame) -> int:
-    """Draw a frame in its window. Return the number of names without space."""
+    """Draw a frame in its window. Return the number of names that did not fit."""
     if scene.ground is not None:
         _paint_map(stage, scene, scene.ground)
     rings = paint_rings(stage) if scene.graph.ego in scene.bodies else []
@@ -393,7 +393,7 @@ def _pen(scene: DrawnFrame, link: DrawnLink) -> tuple[str, float, dict[str, Any]
 
 
 def _paint_halo(stage: Stage, scene: DrawnFrame, node: int) -> None:
-    """Draw a yellow mark around a matched node. Map parts with an outline are coloured instead."""
+    """Draw a yellow mark around a matched node, except a map part with an outline, which is coloured."""
     place = scene.place(node)
     if place is None or (node not in scene.bodies and scene.has_outline(node)):
         return

@@ -122,7 +122,7 @@ def filmed(  # noqa: PLR0913  as many options as the picture has
 
 
 def scale_of(samples: Iterable[Shot]) -> float | None:
-    """Return the radius of a view in metres that fits all given frames; ``None`` without frames."""
+    """Return the radius in metres of a view that fits all given frames; ``None`` if no frame is given."""
     radii = (view_of(graph, None, matched_nodes(marked)).radius for graph, marked, _ in samples)
     return max(radii, default=None)
 
@@ -155,10 +155,10 @@ _PICTURE: Final = re.compile(rb"\xff\xd8\xff|\x89PNG\r\n\x1a\n")
 
 
 class Bindings(Protocol):
-    """Interface of an object that returns the bindings of a query in a frame, to mark matches in a picture."""
+    """Interface of an object that returns the matches of a query in a frame; pictures mark these nodes."""
 
     def bindings(self, frame: FrameRef) -> list[dict[str, int]]:
-        """Return the node ids by variable name, for each match in a frame."""
+        """For each match in a frame, return its nodes: variable name → node id."""
         ...
 
 
@@ -327,7 +327,7 @@ def _chosen(store: Store, frames: FrameRange, fps: float) -> list[FrameRef]:
 
 
 def map_of(file: StoreFile, trace: str) -> RoadMap | None:
-    """Return the road map of a trace of a store; ``None`` without a map."""
+    """Return the road map of a trace of a store; ``None`` if the trace has no map."""
     found = file.road_map_text(trace)
     return read_map(found[1], found[0]) if found else None
 
@@ -335,7 +335,7 @@ def map_of(file: StoreFile, trace: str) -> RoadMap | None:
 def _picture(
     store: Store, frame: FrameRef, camera: str | None, usual: str | None = None
 ) -> bytes | None:
-    """Return the recorded camera picture nearest to a frame, as JPEG or PNG data, or ``None``.
+    """Return the camera picture nearest to a frame, as JPEG or PNG data; ``None`` if none is recorded.
 
     ``usual``: the known default camera.
     """
@@ -357,6 +357,6 @@ def _picture(
 
 
 def camera_of(file: StoreFile, trace: str) -> str:
-    """Return the name of the first recorded channel with camera pictures; empty without such a channel."""
+    """Return the alphabetically first channel with camera pictures; empty if no pictures are recorded."""
     topics = (c.topic for c in file.channels(trace) if c.schema.endswith("CompressedImage"))
     return min(topics, default="")

@@ -32,7 +32,7 @@ LaneSpan = tuple[float, float, bool]
 
 @dataclass(slots=True)
 class Lane:
-    """Lane of a timeline: the time spans of a pattern or a check, for some entities.
+    """Lane of a timeline: the time spans in which some entities match a pattern, or violate a check.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ def timelines(
     asked: Mapping[str, tuple[str, Mapping[str, Any]]],
     traces: str | Collection[str] = (),
 ) -> list[Timeline]:
-    """Return a timeline of matches and violations for each trace of a store.
+    """Evaluate patterns and checks on a store. Return a timeline of matches and violations for each trace.
 
     Parameters
     ----------
@@ -201,7 +201,7 @@ def _spans(intervals: Iterable[Interval], *, violation: bool) -> list[LaneSpan]:
 
 
 def lines_of(timeline: Timeline, letters: int = LETTERS, longest: float = 0.0) -> list[str]:
-    """Return a timeline as lines of text, in which each letter represents an equal part of the time.
+    """Return a timeline as lines of text. Each letter stands for an equal part of the time.
 
     ``█``: true, or violated, for most of the part; ``▌``: for some of it; ``·``: for none of it.
 
@@ -254,7 +254,7 @@ def _merged(spans: Sequence[LaneSpan]) -> list[tuple[float, float]]:
 
 
 def _told(lane: Lane) -> str:
-    """Return the number of time spans of a lane, and their total length, as text."""
+    """Return a summary of a lane as text: number and total length of its time spans."""
     if not lane.spans:
         return lane.verdict
     seconds = sum(end - start for start, end in _merged(lane.spans))
@@ -327,7 +327,7 @@ def draw_timelines(timelines: list[Timeline], to: Path) -> None:
 
 
 def _key(page: Page, kinds: set[bool], more: int) -> None:
-    """Draw the legend of a timeline picture above the lanes, with the number of omitted lanes."""
+    """Draw the legend of a timeline picture. It also states how many lanes are not shown."""
     from matplotlib.patches import Patch
 
     known = ((False, ROAD_EDGE, "found"), (True, EGO, "violated"))
@@ -338,7 +338,7 @@ def _key(page: Page, kinds: set[bool], more: int) -> None:
 
 
 def _draw(page: Page, timeline: Timeline, lanes: int, top: float, longest: float) -> None:
-    """Draw the lanes of one trace below a height of the page. The longest trace has the full width."""
+    """Draw the lanes of one trace below the height ``top``. The longest trace has the full page width."""
     from matplotlib.ticker import MaxNLocator
 
     from sgstore.draw._page import printable

@@ -169,7 +169,7 @@ def _paint_velocity(stage: Stage, body: Body, colour: str) -> None:
 
 
 def _windscreen(stage: Stage, body: Body) -> Outline:
-    """Return the outline of a windscreen: a wedge at the front of a vehicle's box that shows its heading."""
+    """Return the outline of a vehicle's windscreen: a wedge near the front that shows the heading."""
     corners = outline(body, SMALLEST * stage.metre)
     front, rear = corners[:2].mean(axis=0), corners[2:4].mean(axis=0)
     aside = (corners[0] - corners[1]) * 0.34

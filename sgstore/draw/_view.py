@@ -133,7 +133,7 @@ Names = Literal["number", "ident", "type"]
 
 
 def called(graph: SceneGraph, names: Names) -> SceneGraph:
-    """Return a scene graph whose entities are labelled by their recorded ids or types, if known."""
+    """Return a scene graph in which entities are labelled by number, by recorded id or by type."""
     if names == "number":
         return graph
     key = {"ident": "ident", "type": "type_name"}[names]
