@@ -130,7 +130,7 @@ class Export:
             self.tell(frames.number, len(self.clips))
 
     def fresh_windows(self) -> Iterator[ClipFrames]:
-        """Yield groups of frames. A frame in several clips is included only once, for its first clip."""
+        """Yield groups of frames of all clips. A frame in several clips is included once, in its first clip."""
         for frames in self.windows():
             time = frames.log_time_ns
             slack = tolerance_ns(self.trace(frames.clip.trace).period_ns)
@@ -150,17 +150,17 @@ class Export:
     def named_graphs(
         self, frames: ClipFrames, abstraction: str
     ) -> Iterator[tuple[dict[str, str], list[tuple[str, str, str]]]]:
-        """Yield the graph of each frame in an abstraction: labels by node name, and edges between names."""
+        """Yield the graph of each frame in an abstraction: labels of nodes by name, and edges between names."""
         found, _, graphs = self.store.file.abstracted.frames(abstraction, **frames.bounds)
         for row in np.searchsorted(found, frames.seq).tolist():
             yield graphs.named(row)
 
     def label_columns(self, frame_id: Ints) -> dict[str, list[Any]]:
-        """Return the labels of some frames as columns, by label name."""
+        """Return the labels of the given frames: label name → column of values."""
         return {} if self.labels is None else self.labels.of(frame_id)
 
     def label_types(self) -> dict[str, str]:
-        """Return the database type of each label: the narrowest type that can hold all of its values."""
+        """For each label, return the narrowest database type that can hold all of its values."""
         if self.labels is None:
             return {}
         return {name: _type_of(values.tolist()) for name, values in self.labels.values.items()}
@@ -174,7 +174,7 @@ class Export:
             ]
 
     def about(self) -> dict[str, Any]:
-        """Return the content of the manifest file: clips, labels, and the sources of both."""
+        """Return the content of the manifest file: clips, recordings, labels and the origin of the export."""
         traces = {clip.trace: self.trace(clip.trace) for clip in self.clips}
         return {
             "clips": [
@@ -238,7 +238,7 @@ class ClipFrames:
         return len(self.frame_id)
 
     def take(self, rows: slice | Ints) -> ClipFrames:
-        """Return the frames at some indices."""
+        """Return the frames at the given indices."""
         return replace(self, **{name: getattr(self, name)[rows] for name in _TYPES})
 
     def windows(self, size: int = WINDOW) -> Iterator[ClipFrames]:
@@ -248,7 +248,7 @@ class ClipFrames:
 
     @property
     def bounds(self) -> dict[str, int]:
-        """Return the ids of the first and last frame as values of the SQL parameters ``$first``, ``$last``."""
+        """Return the ids of the first and last frame as SQL parameters ``$first`` and ``$last``."""
         return {"first": int(self.frame_id[0]), "last": int(self.frame_id[-1])}
 
 

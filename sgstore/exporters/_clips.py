@@ -42,7 +42,7 @@ _LONGEST_NAME: Final = 80
 
 @dataclass(frozen=True, slots=True)
 class ChannelCount:
-    """Number of messages of a channel in an exported clip, with the id, topic and schema of the source."""
+    """Number of messages of a channel in an exported clip, with its id, topic and schema in the recording."""
 
     id: int
     topic: str
@@ -155,7 +155,7 @@ class WrittenFile:
 
 
 def provenance_of(told: dict[str, str]) -> dict[str, str]:
-    """Return the origin of an export: values of the caller, the hash of its query, and the version."""
+    """Return the origin of an export: the caller's values, the hash of the query, and the package version."""
     query = told.get("query", "")
     digest = {"query_sha256": hashlib.sha256(query.encode()).hexdigest()} if query else {}
     return {**told, **digest, "tool": tool()}
@@ -189,7 +189,7 @@ def safe_name(text: str, otherwise: str) -> str:
 
 
 def check_folder(to: Path) -> None:
-    """Raise an error if an export cannot be written into a folder. It is called before the search.
+    """Raise an error if an export cannot be written into a folder. Call it before the slow search.
 
     Parameters
     ----------
@@ -214,7 +214,7 @@ def check_folder(to: Path) -> None:
 
 @contextmanager
 def export_folder(to: Path) -> Generator[Path]:
-    """Yield a temporary folder for the files of an export. On success, the files are moved to ``to``.
+    """Yield a temporary folder for the files of an export. After success, the files are moved to ``to``.
 
     Parameters
     ----------
@@ -249,13 +249,13 @@ def export_folder(to: Path) -> Generator[Path]:
 
 
 def _mark(thing: Path) -> list[int]:
-    """Return numbers that identify a file or folder even after it is moved."""
+    """Return two numbers (device and inode) that identify a file or folder, even after it is moved."""
     about = thing.lstat()
     return [about.st_dev, about.st_ino]
 
 
 def _undo(left: Path) -> None:
-    """Remove the files that a killed export has already moved into its target folder."""
+    """If an export was killed while it moved its files, remove the moved files from the target folder."""
     try:
         marks = json.loads((left / _MOVING).read_text(encoding="utf-8"))
     except (OSError, ValueError):  # the move had not begun
@@ -277,7 +277,7 @@ def _is_the(thing: Path, mark: list[int]) -> bool:
 
 
 def _is_kept_free(target: Path, thing: Path) -> bool:
-    """True if a target file is still the empty placeholder for a file that was not moved yet."""
+    """True if a target file is an empty placeholder, because the exported file was not moved to it yet."""
     if target.is_symlink() or not (target.exists() and thing.exists()):
         return False
     return not any(target.iterdir()) if target.is_dir() else not target.stat().st_size
@@ -306,7 +306,7 @@ def write_manifest(folder: Path, form: str, content: Mapping[str, Any]) -> None:
 
 
 def _move(things: Sequence[Path], to: Path) -> None:
-    """Move files and folders into a folder, all or none. Existing files are not overwritten."""
+    """Move all files and folders into a folder; after an error, move none. Existing files are kept."""
     moved: list[Path] = []
     try:
         for thing in things:

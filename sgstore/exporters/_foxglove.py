@@ -97,7 +97,7 @@ def _add_message(message: descriptor_pb2.DescriptorProto) -> None:
 
 @cache
 def message_type(name: str) -> type[Any]:
-    """Return the Python class of a Foxglove message type."""
+    """Return the Python class for a Foxglove message type."""
     pool = descriptor_pool.DescriptorPool()
     for file in _descriptors(name).file:
         pool.Add(file)
@@ -321,7 +321,7 @@ def _turn(orientation: Any, turn: tuple[float, float, float, float]) -> None:
 
 
 def place_of(about: Mapping[str, Any]) -> tuple[float, float, float] | None:
-    """Return the position (x, y, z) of a node in metres. ``None`` means an unknown position."""
+    """Return the position (x, y, z) of a node in metres; ``None`` if it is unknown."""
     if "x" not in about or "y" not in about:
         return None
     return about["x"], about["y"], about.get("z", 0.0)

@@ -64,7 +64,7 @@ Place = tuple[int, int]
 
 @dataclass(slots=True)
 class _FrameMessage:
-    """Reference to a recorded sensor message that belongs to a frame."""
+    """Recorded sensor message of a frame: its channel, log time and position in the recording."""
 
     frame_id: int
     seq: int
@@ -81,7 +81,7 @@ Found = dict[tuple[str, Place], File | None]
 
 @dataclass(slots=True)
 class _Film:
-    """Video file that is being written, with the number of its pictures and the position of the last one."""
+    """Video file while it is written: format, number of pictures, position of the last recorded message."""
 
     path: Path
     form: str
@@ -89,7 +89,7 @@ class _Film:
     count: int
 
     def as_file(self) -> File:
-        """Return the last picture of the video as values for the table of files."""
+        """Return the row of the file table for the last picture of the video."""
         name = f"{self.path.parent.name}/{self.path.name}"
         return name, "video", self.form, str(self.count - 1), ""
 
@@ -129,7 +129,7 @@ class _Tables:
 
 
 def write(export: Export, folder: Path) -> list[WrittenFile]:
-    """Write the sensor messages of the clips as files, with tables. Pictures are checked if possible."""
+    """Write the sensor messages of the clips as files, with tables. If Pillow is installed, check pictures."""
     _check_channels(export)
     names = list(export.labels.texts) if export.labels is not None else []
     places: list[Path] = []
@@ -259,7 +259,7 @@ class _Writing:
         wanted: dict[tuple[str, Place], _FrameMessage],
         found: Found,
     ) -> None:
-        """Write the messages at the given positions of the recording to files.
+        """Write the wanted messages of the recording to files. Add the file of each message to ``found``.
 
         ``None`` means that a message is neither a picture nor a point cloud.
         """
@@ -293,7 +293,7 @@ class _Writing:
         found: Found,
         ends: dict[str, Place],
     ) -> None:
-        """Write a message to a file if a frame needs it, or if a video needs it for a later picture."""
+        """Write a message to a file if a frame uses it, or if a video needs it for a later picture."""
         channel = self.recording.channels.get(int(run.channel[at]))
         if channel is None:
             return
@@ -352,7 +352,7 @@ class _Writing:
         return f"{self.folder.name}/{name}", holds, form, "", digest
 
     def _begin(self, row: _FrameMessage, video: Sensed) -> File | None:
-        """Start a video file with the last key frame before a picture, and all pictures up to it."""
+        """Start a video file. Write the last key frame before a picture, and all pictures from there to it."""
         try:
             carried = self.export.store.file.carried(row.frame_id, row.channel)
         except (TraceError, StoreError) as error:
@@ -415,7 +415,7 @@ class _Writing:
 
 
 def _test_picture(path: Path, data: bytes) -> None:
-    """Raise an error if a written picture cannot be opened. Without the package Pillow, do nothing.
+    """Raise an error if a written picture cannot be opened. Do nothing if Pillow is not installed.
 
     Raises
     ------

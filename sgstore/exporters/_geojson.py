@@ -72,7 +72,7 @@ def write(export: Export, folder: Path) -> list[WrittenFile]:
 
 
 def _projection(text: str, crs: str) -> tuple[Placed | None, str]:
-    """Return a function from map axes to longitude and latitude, or ``None`` and the reason."""
+    """Return a function that converts map coordinates to longitude and latitude, or ``None`` and a reason."""
     found = _GEO.search(text)
     system = crs or (found[1].strip() if found else "")
     local = "coordinates are metres in the axes of the road map"

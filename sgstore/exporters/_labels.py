@@ -90,7 +90,7 @@ class Labels:
         frame_id: Ints,
         **parameters: object,
     ) -> Labels:
-        """Return the labels of some frames, computed by queries on the store.
+        """Evaluate label expressions and queries on a store. Return the labels of the given frames.
 
         Parameters
         ----------
@@ -116,7 +116,7 @@ class Labels:
         return cls(texts, wanted, values)
 
     def of(self, frame_id: Ints) -> dict[str, list[Any]]:
-        """Return labels of frames as columns by name. The labels must have been computed before."""
+        """Return the computed labels of the given frames: label name → column of values."""
         rows = np.searchsorted(self.frame_id, frame_id)
         return {name: values[rows].tolist() for name, values in self.values.items()}
 
@@ -152,7 +152,7 @@ def _over_matches(
     matches: Matches,
     wanted: Ints,
 ) -> np.ndarray[Any, np.dtype[np.object_]]:
-    """Return a column of labels: the value of a match in all of its frames. Other frames have no value."""
+    """Return a label for each frame: the value of the match that contains the frame; otherwise ``None``."""
     values = np.full(len(wanted), None, object)
     taken = np.zeros(len(wanted), np.bool_)
     traces = _trace_ids(store)
@@ -172,7 +172,7 @@ def _over_matches(
 def _answers(
     store: Store | Collection, text: str, wanted: Ints, parameters: Mapping[str, object]
 ) -> Iterator[tuple[Ints, np.ndarray[Any, np.dtype[np.object_]]]]:
-    """Yield indices of frames with the values of an expression: first frames with an ego, then the others."""
+    """Yield frame indices and the values of an expression there: first for frames with an ego, then others."""
     value = f"{text}) AS label"
     try:
         matches = store.find(_OF_EGO + value, **parameters)
@@ -197,7 +197,7 @@ _OF_ANYTHING: Final = f"MATCH (anything) {_RETURNED}"
 
 
 def _of_expression(error: QueryError, text: str) -> QueryError:
-    """Convert an error of the internal query to an error that marks a part of the user's expression."""
+    """Convert an error of the internal query, so that it marks a part of the expression that the user typed."""
     if error.span is None:
         return QueryError(error.reason, text=text, hint=error.hint)
     before, end = len(_OF_EGO), len(text)
@@ -207,7 +207,7 @@ def _of_expression(error: QueryError, text: str) -> QueryError:
 
 
 def _columns(matches: Matches, wanted: Ints) -> tuple[Ints, np.ndarray[Any, np.dtype[np.object_]]]:
-    """Return the indices of the wanted frames that match a query, and the values of the matches."""
+    """Return the indices of the wanted frames in which a query matches, and the values of these matches."""
     found = matches.numpy()
     of, row = _rows(wanted, found["frame_of_label"].astype(np.int64))
     values = found["label"].astype(object)
@@ -216,7 +216,7 @@ def _columns(matches: Matches, wanted: Ints) -> tuple[Ints, np.ndarray[Any, np.d
 
 
 def _rows(wanted: Ints, frame_id: Ints) -> tuple[Ints, Ints]:
-    """Return positions of wanted frames in an array of frame ids, and their indices in ``wanted``."""
+    """Return the positions in ``frame_id`` of the wanted frames, and their indices in ``wanted``."""
     row = np.minimum(np.searchsorted(wanted, frame_id), max(len(wanted) - 1, 0))
     of = np.flatnonzero(wanted[row] == frame_id) if len(wanted) else row[:0]
     return of, row[of]

@@ -149,7 +149,7 @@ def _survey(recording: RecordingFile, trace: StoredTrace, context: MessageRefs) 
 def _context_of(
     refs: MessageRefs, reach: Clip
 ) -> tuple[dict[int, list[int]], set[tuple[int, int]]]:
-    """Return the messages outside a clip that its frames need, such as the road map.
+    """Return messages outside a clip on which its frames depend, such as the road map.
 
     Context from before the start is included. If the context of a channel begins only after the
     end, as for a map that is recorded last, its first message is included, unless the clip has
@@ -261,7 +261,7 @@ class _Cutting:
             yield number, channel.topic, schema.name if schema else ""
 
     def _write_head(self, reach: Clip) -> list[Loss]:
-        """Write the schemas, channels, metadata and attachments of the recording. Return the lost parts.
+        """Write the schemas, channels, metadata and attachments of the recording. Return what was lost.
 
         ``reach`` is the interval with a time tolerance at its ends, as readers of the clip need it.
         """
@@ -305,7 +305,7 @@ class _Cutting:
         self._counts[record.id] = 0
 
     def _write_attachment(self, pieces: Iterable[memoryview]) -> str:
-        """Copy an attachment of the recording, given in pieces. Return its defect, or an empty text.
+        """Copy an attachment of the recording. Return its fault as text; empty if it has none.
 
         Returns
         -------
@@ -374,7 +374,7 @@ class _Cutting:
 
 
 def _among(run: Messages, places: dict[int, list[int]]) -> NDArray[np.bool_]:
-    """Return a mask of the messages whose position is in ``places`` (chunk offset → message offsets)."""
+    """True for each message whose position is in ``places`` (offset of the chunk → offsets of messages)."""
     chunks, found = run.chunks, np.zeros(len(run), np.bool_)
     for chunk in np.unique(chunks).tolist():
         found |= (chunks == chunk) & np.isin(run.offset, places.get(chunk, ()))

@@ -67,7 +67,7 @@ def write(export: Export, folder: Path) -> list[WrittenFile]:
 
 
 def _is_derived(export: Export) -> bool:
-    """True if a name means a derived set of relations, not an abstraction of graphs."""
+    """True if the requested name is a derived set of relations. False for an abstraction of graphs."""
     derived = {normalize_name(one.name) for one in export.store.file.deriving.sets()}
     name = normalize_name(export.abstraction)
     return name in derived and name not in abstractions()

@@ -180,7 +180,7 @@ class _Labelling:
         return told | trace.report.get("metadata", {}) if self._again else told
 
     def _window(self, frames: ClipFrames) -> Iterable[tuple[int, dict[str, Any]]]:
-        """Yield the number of each frame, with its objects and relations as OpenLABEL data."""
+        """For each frame, yield its number, and its objects and relations as OpenLABEL data."""
         place = {int(one): i for i, one in enumerate(self._frames.frame_id.tolist())}
         ids: list[int] = frames.frame_id.tolist()
         own = self._own(frames)
@@ -217,7 +217,7 @@ class _Labelling:
             yield number, {"frame_properties": properties, **within[frame_id]}
 
     def _own(self, frames: ClipFrames) -> dict[tuple[int, int], dict[str, Any]]:
-        """Return the imported user-defined attributes by frame and node."""
+        """Return user-defined attributes of imported graphs: name → value, for each frame and node."""
         found: dict[tuple[int, int], dict[str, Any]] = {}
         if not self._trace.report.get("imported"):
             return found
@@ -263,7 +263,7 @@ class _Labelling:
         return found
 
     def objects(self) -> set[str]:
-        """Return the keys of the exported objects."""
+        """Return the OpenLABEL ids of all exported objects."""
         nodes = [node for node in self.seen if self._kinds.get(node) not in _SECTIONS]
         return {self._uids.get(node, str(node)) for node in nodes}
 

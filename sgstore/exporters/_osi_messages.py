@@ -181,7 +181,7 @@ class OsiFrames:
         return self._given
 
     def _name(self, thing: Any, entity: Entity) -> None:
-        """Write the number of an entity into an OSI object, with its recorded id and its map reference."""
+        """Write the number, the recorded id and the map reference of an entity into an OSI object."""
         number = self._number(entity.ident)
         thing.id.value = number
         if str(number) != entity.ident:
@@ -270,7 +270,7 @@ def _write_base(base: Any, values: dict[str, float]) -> None:
 
 
 def _write_vector(out: Any, names: dict[str, str], values: dict[str, float]) -> None:
-    """Write the known components of a vector into an OSI message. If the first one is unknown, write nothing.
+    """Write a vector into an OSI message; unknown components become 0. If the first is unknown, skip it.
 
     In OSI a missing number of a vector is 0, and a missing vector is unknown.
     """

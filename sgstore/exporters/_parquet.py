@@ -107,14 +107,14 @@ _NOT_EXPORTED: Final = (
 
 
 class _Present:
-    """Entities that occur in each clip, and the trace of each clip, by clip number."""
+    """For each clip number, the entities in the clip and its trace."""
 
     def __init__(self) -> None:
         self.nodes: defaultdict[int, set[int]] = defaultdict(set)
         self.trace: dict[int, int] = {}
 
     def see(self, name: str, clip: int, columns: Mapping[str, Any]) -> None:
-        """Add the entities in the rows of a table to those of a clip."""
+        """Record the entities, or the trace, that the rows of a table contain for a clip."""
         if name == "frames" and len(columns["trace_id"]):
             self.trace.setdefault(clip, int(columns["trace_id"][0]))
         elif name == "nodes":
@@ -155,7 +155,7 @@ def _of_clip(
     found: Mapping[str, np.ndarray[Any, Any]],
     labels: Mapping[str, str],
 ) -> dict[str, Any]:
-    """Return the rows of a table that belong to a clip, with the clip number and the labels."""
+    """Return those rows of a table that belong to a clip. Add the clip number and the labels as columns."""
     frame_id = np.asarray(found["frame_id"]).astype(np.int64)
     rows = np.isin(frame_id, frames.frame_id)
     columns: dict[str, Any] = {name: values[rows] for name, values in found.items()}
@@ -220,7 +220,7 @@ def _unit(table: str, column: str) -> dict[str, str]:
 
 
 def _card(export: Export, counts: Mapping[str, int]) -> str:
-    """Return the data set card (README text) of an export, with the header of the Hugging Face hub."""
+    """Return the text of the data set card (README) of an export, with the header for the Hugging Face hub."""
     about = export.about()
     head = ["---", "tags:", "- autonomous-driving", "- scene-graph", "configs:"]
     for name in counts:

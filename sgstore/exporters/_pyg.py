@@ -75,7 +75,7 @@ _KINDS: Final = {
 
 
 class _TensorColumns:
-    """Columns of exported graphs as growing ``.npy`` files, with their numbers of rows.
+    """Files ``.npy`` that grow during the export, one for each column of the graphs.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ class _TensorColumns:
             stream.close()
 
     def _write_head(self, name: str) -> None:
-        """Write the header of a column file with its number of rows. It is 0 first, and final at the end."""
+        """Write the header of a column file, with the number of rows so far."""
         dtype, width = self._kinds[name]
         shape = (self._rows[name], width) if width else (self._rows[name],)
         # Numpy reserves room for the largest number, so that the length of the header is constant.
@@ -141,7 +141,7 @@ class _TensorColumns:
 
 
 def _kind_of(values: list[Any]) -> tuple[str, list[str]]:
-    """Return the type of a label (``bool``, ``number`` or ``text``), and the words of a text label."""
+    """Return the type of a label (``bool``, ``number`` or ``text``). Also return all values of a text label."""
     known = [value for value in values if value is not None]
     if all(isinstance(value, bool) for value in known):
         return "bool", []
@@ -232,7 +232,7 @@ def _about(export: Export, abstraction: str, columns: _TensorColumns) -> dict[st
 def _columns_of(
     export: Export, frames: ClipFrames, abstraction: str, columns: _TensorColumns
 ) -> dict[str, NDArray[Any]]:
-    """Return the graphs of some frames as columns. ``nodes`` and ``edges`` are counts per graph."""
+    """Return the graphs of some frames as columns. ``nodes`` and ``edges`` are their numbers per graph."""
     found, seen, labelled = export.store.file.abstracted.frames(abstraction, **frames.bounds)
     wanted = np.full(len(found), -1)
     wanted[np.searchsorted(found, frames.seq)] = np.arange(len(frames))
@@ -280,7 +280,7 @@ def _edges(labelled: Labelled) -> tuple[NDArray[Any], ...]:
 
 
 def _row(labelled: Labelled, frame: NDArray[Any], node: NDArray[Any]) -> NDArray[np.int64]:
-    """Return the array index of each given node in its frame. Nodes must ascend."""
+    """Return the array index of each given node in its frame. The array is sorted by frame and node."""
     low = int(labelled.node.min(initial=0))
     span = int(labelled.node.max(initial=0)) - low + 1
     keys = labelled.node_frame * span + (labelled.node - low)
@@ -322,7 +322,7 @@ def _features(seen: GraphColumns, frame: NDArray[Any], node: NDArray[Any]) -> ND
 
 
 def _sorted(file: Path, names: list[str]) -> list[str]:
-    """Sort names alphabetically, and change their numbers in a file accordingly. Return the sorted names."""
+    """Sort the names, and replace their old indices in a file by the new ones. Return the sorted names."""
     order = sorted(range(len(names)), key=names.__getitem__)
     place = np.zeros(len(names) + 1, np.int16)
     place[order] = np.arange(len(names))

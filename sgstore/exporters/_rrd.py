@@ -196,7 +196,7 @@ class RerunClip:
         self._write_graph(graph, places)
 
     def _clear_edges(self, graph: SceneGraph) -> None:
-        """Clear the drawn lines of relations that have no edges in this frame."""
+        """Remove lines of earlier frames from the viewer, for each relation without edges in this frame."""
         now = {self._path("world", "edges", relation) for _, relation, _, _ in graph.edges}
         for path in sorted(path for path in self.paths - now if path.startswith("world/edges/")):
             self._out.log(path, self._rerun.Clear(recursive=False))
@@ -277,7 +277,7 @@ _SPREAD: Final = 8.0
 
 
 def _axes_of(record: Mapping[str, Any]) -> str:
-    """Return the name of the coordinate axes (``frame_id``) of a sensor message."""
+    """Return the name of the coordinate axes that a sensor message states (``frame_id``)."""
     header = record.get("header")
     held = header if isinstance(header, Mapping) else record
     return str(held.get("frame_id", ""))
@@ -292,7 +292,7 @@ def _rgba(colour: drawn.Colour) -> list[int]:
 
 
 def _lines(graph: SceneGraph, places: dict[int, Any]) -> dict[str, list[Any]]:
-    """Return the lines between connected nodes, by relation, as pairs of positions."""
+    """For each relation, return its edges as lines: pairs of node positions."""
     found: dict[str, list[Any]] = {}
     for src, relation, dst, _ in graph.edges:
         if places.get(src) and places.get(dst):

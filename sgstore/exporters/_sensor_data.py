@@ -83,7 +83,7 @@ Record = Mapping[str, Any]
 
 
 def sensor_of(channel: Channel, schema: Schema | None) -> Callable[[bytes], Sensed | None]:
-    """Return a function that decodes the messages of a channel. It returns ``None`` for other data.
+    """Return a function that decodes the messages of a channel. For other data, the function returns ``None``.
 
     It raises ``TraceError`` for an inconsistent picture or cloud.
     """

@@ -48,7 +48,7 @@ TOLD: Final = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """Constant position and rotation of a sensor relative to the ego, or of axes relative to other axes.
+    """Constant pose (position and rotation) of a sensor relative to the ego, or of axes relative to others.
 
     Attributes
     ----------
@@ -98,7 +98,7 @@ def parse_mounts(texts: Iterable[str]) -> tuple[Mount, ...]:
 
 
 def _ends(axes: str, mounts: Mapping[str, Mount]) -> str:
-    """Return the outermost parent of coordinate axes."""
+    """Follow the parents of coordinate axes, and return the last one."""
     while axes in mounts:
         axes = mounts[axes].parent
     return axes
@@ -141,7 +141,7 @@ class FrameTransforms:
             self._fixed.append(AxesTransform(AXES, GLOBAL, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
 
     def of(self, graph: SceneGraph) -> Iterator[AxesTransform]:
-        """Yield positions and rotations for a frame. Without an ego, yield only the constant ones."""
+        """Yield the poses (position and rotation) for a frame. Without an ego, yield only the constant ones."""
         about = graph.nodes.get(graph.ego) if graph.ego is not None else None
         if about is not None and "x" in about and "y" in about:
             yield _of_ego(about, self.ego)

@@ -60,7 +60,7 @@ def layout(channels: Sequence[ChannelCount], ego: str) -> str:
 
 
 def _topics(channels: Sequence[ChannelCount], endings: tuple[str, ...]) -> list[str]:
-    """Return the topics of channels with messages, selected by the last word of their schema name."""
+    """Return the topics of channels that contain messages and whose message type is one of the given ones."""
     found = [
         one.topic
         for one in channels
@@ -74,7 +74,7 @@ def _split(direction: str, first: Any, second: Any, share: int) -> dict[str, Any
 
 
 def _camera(image: str, calibrations: Sequence[str]) -> dict[str, Any]:
-    """Return the viewer panel of a camera, with the calibration topic in the same namespace."""
+    """Return the viewer panel of a camera. It uses the calibration topic in the namespace of the camera."""
     place = image.rpartition("/")[0]
     beside = [topic for topic in calibrations if topic.rpartition("/")[0] == place]
     mode = {"imageTopic": image} | ({"calibrationTopic": beside[0]} if beside else {})

@@ -86,7 +86,7 @@ WHERE frame_id >= $first AND frame_id <= $last AND node_id = $node AND light_sta
 
 @dataclass(slots=True)
 class EntityTrack:
-    """States of an entity over the frames of a clip, as columns (n,).
+    """Columns (n,) with the states of an entity, one row for each frame of a clip in which it occurs.
 
     Attributes
     ----------
@@ -104,7 +104,7 @@ class EntityTrack:
     speed: Numbers
 
     def stretches(self) -> Iterator[tuple[int, int]]:
-        """Yield the first and last index of each sequence of frames without a gap."""
+        """Yield the first and last index of each sequence of frames without gaps."""
         ends = np.flatnonzero(np.diff(self.row) > 1).tolist()
         yield from zip([0, *(end + 1 for end in ends)], [*ends, len(self.row) - 1], strict=True)
 
@@ -197,7 +197,7 @@ class Scenario:
                 )
 
     def losses(self) -> list[Loss]:
-        """Return the parts of the clip that are left out or assumed in the scenario, with reasons."""
+        """Return the data that the scenario lacks or that are only assumed, each with a reason."""
         told: list[Loss] = []
         if self._unsized:
             reason = f"the size of {_some(self._unsized)} is not known: a usual one is written"
@@ -286,7 +286,7 @@ class Scenario:
         track: EntityTrack,
         ends: tuple[int, int],
     ) -> None:
-        """Write the appearance, the trajectory and the disappearance of an entity as scenario events."""
+        """Write scenario events of an entity: it appears, follows its trajectory, and disappears."""
         low, high = ends
         times, poses = self._seconds[track.row[low : high + 1]], track.pose[low : high + 1]
         start = float(times[0])
@@ -362,7 +362,7 @@ def _some(names: Sequence[str]) -> str:
 
 
 def _unwrapped(heading: Numbers) -> Numbers:
-    """Return headings without jumps by full rotations. Unknown headings remain unknown."""
+    """Return the headings unwrapped: no jumps by full turns. Unknown headings remain unknown."""
     known = np.isfinite(heading)
     out = heading.copy()
     out[known] = np.unwrap(heading[known])

@@ -161,12 +161,12 @@ class GraphData:
         return found
 
     def sequences(self) -> Iterator[range]:
-        """Yield the range of graph numbers of each clip, in order of time."""
+        """For each clip, yield the range of numbers of its graphs, in order of time."""
         for clip in self.about["clips"]:
             yield range(*clip["graphs"])
 
     def by_trace(self) -> dict[str, list[int]]:
-        """Return the graph numbers of each trace, for a split into training and test data."""
+        """For each trace, return the numbers of its graphs, to split training data from test data."""
         found: dict[str, list[int]] = {}
         for clip in self.about["clips"]:
             found.setdefault(clip["trace"], []).extend(range(*clip["graphs"]))
@@ -315,7 +315,7 @@ class GraphDataset:
     def _hetero_data(
         self, graph: dict[str, NDArray[Any]], kind: NDArray[Any], relation: NDArray[Any]
     ) -> Any:
-        """Return a graph as ``HeteroData`` with all node types and triples, even empty ones, for batching."""
+        """Convert a graph to ``HeteroData`` with all node types and triples, even empty ones, for batching."""
         made = self._data.HeteroData()
         tensor = self._torch.from_numpy
         own = np.zeros(len(kind), np.int64)
@@ -360,7 +360,7 @@ class GraphDataset:
 
 
 def _renumbered(own: list[str], wanted: list[str], folder: str | Path) -> NDArray[np.int64]:
-    """Return, for each name of one list, its index in another list."""
+    """For each name in ``own``, return its index in ``wanted``. Raise an error for a missing name."""
     place = {name: i for i, name in enumerate(wanted)}
     missing = [name for name in own if name not in place]
     if missing:
