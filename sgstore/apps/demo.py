@@ -126,7 +126,7 @@ def _ingest(store: Path, sample: Path, say: Say) -> None:
 def _answer(
     store: Store, folder: Path, say: Say, name: str, sentence: str, pattern: str
 ) -> Path | None:
-    """Run a query, report the intervals of its matches, and draw a frame from the middle of the first."""
+    """Run a query, and report the intervals of its matches. Draw the middle frame of the first interval."""
     say("")
     say(sentence)
     say("")

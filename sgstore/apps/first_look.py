@@ -49,7 +49,7 @@ STORE: Final = "drives.sgstore"
 
 @dataclass(frozen=True)
 class FirstLookEntry:
-    """Entry of a first look, with the command lines that reproduce it.
+    """Entry of a first-look report, with command lines and code that reproduce it.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class FirstLookEntry:
 
 @dataclass
 class FirstLook:
-    """Report on some recordings: contents, rare and critical scenes, violated rules and missing data.
+    """Report on a sample of recordings: contents, rare and critical scenes, violated rules, missing data.
 
     Attributes
     ----------
@@ -214,7 +214,7 @@ def evaluate(look: FirstLook, each: Each = lambda items, _: items) -> None:
 
 
 def _rare(look: FirstLook, each: Each) -> list[FirstLookEntry]:
-    """Return the patterns of the library with the fewest matches. Note the patterns that cannot be answered."""
+    """Return the rarest patterns of the library in the sample. Note patterns that cannot be answered."""
     found: list[tuple[int, str, str, Interval]] = []
     asked = [one for one in patterns().values() if one.kind in {"concept", "scenario"}]
     traces = len(look.store.traces())
@@ -244,7 +244,7 @@ def _rare(look: FirstLook, each: Each) -> list[FirstLookEntry]:
 
 
 def _critical(store: Store) -> list[FirstLookEntry]:
-    """Return the most critical scenes."""
+    """Return the most critical scenes of the sample: the clips with the highest risk."""
     spec = PrioritySpec(Priority.risk, tuple(MEASURES), SelectionUnit.clip, CLIP_S)
     ordered = prioritize(ChosenFrames(STORE, store), spec)
     entries: list[FirstLookEntry] = []
@@ -310,7 +310,7 @@ def _oddities(outcome: TraceOutcome) -> Iterator[str]:
 
 
 def _kind_of(text: str) -> str:
-    """Return a warning with its numbers replaced, to count equal warnings of several recordings."""
+    """Replace the numbers in a warning, so that similar warnings can be counted together."""
     return " ".join("N" if any(c.isdigit() for c in word) else word for word in text.split())
 
 

@@ -41,7 +41,7 @@ def load(ipython: Any) -> None:
 
 
 def _picture(graph: Any) -> bytes | None:
-    """Return a scene graph as a PNG picture for a notebook. ``None`` means that a package is missing."""
+    """Return a scene graph as a PNG picture for a notebook; ``None`` if the drawing packages are missing."""
     from sgstore.draw import graph_picture
     from sgstore.errors import MissingExtraError
 
@@ -80,7 +80,7 @@ class SgqlCell:
         return answer
 
     def _options(self, line: str) -> tuple[Store, str]:
-        """Return the store for a notebook cell, and the variable name for its result."""
+        """Parse the first line of a notebook cell. Return the store, and the variable name for the result."""
         try:
             words = shlex.split(line)
         except ValueError as error:
@@ -115,7 +115,7 @@ class SgqlCell:
         return store.check(text, **values) if _has_checks(text) else store.find(text, **values)
 
     def _values(self, text: str) -> dict[str, Any]:
-        """Return the notebook variables that a query uses as ``$name``, without those defined in the query."""
+        """Return the notebook variables that a query uses as ``$name`` and does not define itself."""
         bare = _NO_NAMES.sub("''", text)
         own = {name for part in _SCENARIO.findall(bare) for name in _DEFAULT.findall(part)}
         wanted = dict.fromkeys(name for name in _VALUE.findall(bare) if name not in own)
@@ -123,7 +123,7 @@ class SgqlCell:
 
 
 def _has_checks(text: str) -> bool:
-    """True if a query text contains ``CHECK`` statements; invalid texts are searched for the word."""
+    """True if a query text contains a ``CHECK`` statement, or in an invalid text the word ``CHECK``."""
     from sgstore.errors import QueryError
     from sgstore.lang.syntax import parse
     from sgstore.lang.syntax.tree import CheckClause

@@ -107,7 +107,7 @@ class ClipScene:
         return None if self._asked is None else self._asked()
 
     def verify(self, *, messages: bool = False) -> None:
-        """Fail the test if the store differs from the lock file; each lock is compared once per session.
+        """Fail the test if the store differs from the lock file. Each lock is compared once per session.
 
         Parameters
         ----------

@@ -166,7 +166,7 @@ class _FrameWriter:
             self._on_frame(self._frames, self.seconds)
 
     def drain(self, sensors: Sensors, timeout_s: float) -> None:
-        """Write the waiting sensor data, from the time of the first frame on."""
+        """Write the sensor data that have arrived. Skip data from before the first frame."""
         for reading in sensors.waiting(timeout_s):
             if reading.time_ns >= self._start_ns:
                 self._recorder.reading(reading)
@@ -185,7 +185,7 @@ class _FrameWriter:
 
 
 def _snapshots(world: Any, step_s: float | None) -> Generator[Any]:
-    """Yield snapshots of a CARLA world. The world runs freely, or is advanced by fixed steps."""
+    """Yield snapshots of a CARLA world. If ``step_s`` is given, advance the world by it before each."""
     if step_s is None:
         while True:
             try:

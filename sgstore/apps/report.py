@@ -99,7 +99,7 @@ def report(
 
 @dataclass(frozen=True)
 class PlayableMatches:
-    """Matches of a query that a notebook displays as an interactive page, in an isolated HTML frame.
+    """Matches of a query. A notebook displays them as an interactive page, in an isolated HTML frame.
 
     Attributes
     ----------
@@ -155,7 +155,7 @@ def _made(
     around_s: float,
     pictures: bool,  # noqa: FBT001 - as report has it
 ) -> tuple[str, int, bool]:
-    """Return an HTML page of matches, the number of matches, and True if the query has more matches."""
+    """Return an HTML page of matches and the number of matches. True: the query has more matches."""
     with store.file.snapshot():
         kept, found, truncated = _kept(store, text, dict(parameters or {}), most, around_s)
         if pictures:
@@ -166,7 +166,7 @@ def _made(
 def _kept(
     store: Store, text: str, values: dict[str, Any], most: int, around_s: float
 ) -> tuple[dict[str, Any], list[Found], bool]:
-    """Return the data of a report page as JSON values, the matches, and True if the query has more matches."""
+    """Return the data of a report page for JSON, and its matches. True: the query has more matches."""
     is_check = re.match(r"\s*(?:--[^\n]*\n\s*)*(?:DEFINE\b[^;]*;\s*)*CHECK\b", text, re.IGNORECASE)
     question = {"text": text, "parameters": values}
     asked = {"ask": "check" if is_check else "matches", "absent": True, **question}
@@ -201,7 +201,7 @@ def _kept(
 
 
 def _spread(told: list[dict[str, Any]], most: int) -> list[dict[str, Any]]:
-    """Return replies with at most ``most`` matches or violations in total.
+    """Keep at most ``most`` matches or violations in the replies to a query; return the replies.
 
     They are spread over the traces, or the first ones in the order of the query.
     """
@@ -222,7 +222,7 @@ def _spread(told: list[dict[str, Any]], most: int) -> list[dict[str, Any]]:
 
 
 def chosen_spread(traces: list[str], most: int) -> set[int]:
-    """Return indices of ``most`` items, spread over the traces and evenly over the items of each trace.
+    """Choose ``most`` items, spread over the traces and evenly within each trace. Return their indices.
 
     Parameters
     ----------
@@ -280,7 +280,7 @@ def _times(store: Store, trace: str, frames: int) -> NDArray[np.float64]:
 
 
 def _spans(found: list[Found], times: Mapping[str, NDArray[np.float64]], around_s: float) -> Spans:
-    """Return for each trace the ranges of frames that contain its matches and the time around them."""
+    """For each trace, return the ranges of frames to show: its matches, and some seconds around each."""
     spans: Spans = {}
     for trace, first, last, _ in sorted(found, key=lambda match: match[:3]):
         t, around = times[trace], around_s + 1e-6  # times have six decimals
@@ -295,7 +295,7 @@ def _spans(found: list[Found], times: Mapping[str, NDArray[np.float64]], around_
 
 
 def _parts(store: Store, question: Mapping[str, Any], found: list[Found]) -> dict[str, Any]:
-    """Return for each trace and match the frames in which each part of the pattern is true."""
+    """For each match, return the frames in which each part of the pattern is true."""
     first = {
         _key(trace, nodes or None): (trace, seq, nodes) for trace, seq, _, nodes in found[::-1]
     }
@@ -312,7 +312,7 @@ def _parts(store: Store, question: Mapping[str, Any], found: list[Found]) -> dic
 def _columns(
     store: Store, reads: Reads, traces: Mapping[str, Any], spans: Spans
 ) -> Iterator[tuple[str, str]]:
-    """Yield the binary data of a report page by request key: states in frame ranges, static entities, maps."""
+    """Yield the binary data of a report page (static entities, maps, states), each with its request key."""
     maps: set[str] = set()
     for name, about in traces.items():
         yield _key("api/static", name), _small(reads.static(name))
@@ -328,7 +328,7 @@ def _columns(
 
 
 def _states(store: Store, trace: str, first: int, last: int, spans: list[tuple[int, int]]) -> bytes:
-    """Return the states of a trace in some frame ranges as bytes; frames outside the ranges have no states."""
+    """Return the entity states of a trace as bytes. Frames outside the given ranges have no states."""
     of = StateColumns(store.file)
     with store.file.snapshot():
         frames, states = of.frames(trace, first, last), of.states(trace, first, last)
@@ -349,7 +349,7 @@ def _small(data: bytes) -> str:
 def _pictures(
     store: Store, traces: list[dict[str, Any]], matches: list[Found]
 ) -> dict[str, dict[str, str]]:
-    """Return pictures of the first camera of each trace, one for each second of a match."""
+    """Return pictures of the first camera of each trace: one picture for each second of each match."""
     reads, found = Reads(store), dict[str, dict[str, str]]()
     cameras = {one["name"]: one["cameras"] for one in reads.about()["traces"]}
     for about in traces:
@@ -382,7 +382,7 @@ _MINIFIED: Final = re.compile(r"export\{([^}]*)\};?\s*$")
 
 
 def script() -> str:
-    """Return the JavaScript of a report page as one script. Each module becomes a function."""
+    """Combine the JavaScript modules of a report page into one script, and return its text."""
     parts: list[str] = []
     names: dict[Path, str] = {}
 
@@ -409,7 +409,7 @@ def _imported(found: re.Match[str], name: str) -> str:
 
 
 def _exported(text: str) -> str:
-    """Return the text of a JavaScript module as the body of a function that returns its exports."""
+    """Convert a JavaScript module to the body of a function that returns the exports of the module."""
     minified = _MINIFIED.search(text)
     if minified:
         pairs = (one.split(" as ") for one in minified[1].split(","))

@@ -76,7 +76,7 @@ queries; bytes."""
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """Rows that a sandbox process returns for a query, with the traces that cannot answer it.
+    """Result rows of a query from a sandbox process, and the traces that cannot answer the query.
 
     Attributes
     ----------
@@ -176,7 +176,7 @@ class Sandbox:
 
     @property
     def folder(self) -> Path | None:
-        """Return the folder for tables of the sandbox process; ``None`` means that no process runs."""
+        """Return the folder for tables of the sandbox process; ``None`` if no process runs."""
         return self._folder
 
     def sql(self, text: str) -> Answer:
@@ -228,7 +228,7 @@ class Sandbox:
             return _granted(self._exchange(self._ready(), question, self._timeout_s))
 
     def replies(self, question: Mapping[str, object]) -> Iterator[dict[str, Any]]:
-        """Yield the replies of the sandbox process to a query on arrival.
+        """Send a query to the sandbox process, and yield each reply as soon as it arrives.
 
         The process is stopped if the caller ends the iteration early.
 
@@ -368,7 +368,7 @@ def _check_length(question: Mapping[str, object], error: type[SgstoreError]) -> 
 
 
 def _granted(reply: Any) -> dict[str, Any]:
-    """Return the reply of a sandbox process. An error in the reply is raised."""
+    """Return a reply of the sandbox process. If the reply contains an error, raise it."""
     if "query" in reply or "error" in reply:
         raise error_of(reply)
     return reply
@@ -382,13 +382,13 @@ def _answer(reply: dict[str, Any]) -> Answer:
 
 
 class Workshop(Sandbox):
-    """Sandbox process for the program's own tasks, which may write files. A task can be cancelled at once."""
+    """Sandbox process for the program's own tasks. They may write files, and can be cancelled at once."""
 
     may_write: ClassVar[bool] = True
 
 
 class Errand:
-    """Long task in a separate process (:class:`Workshop`), with the interface of :class:`SandboxPool`.
+    """Long task in a separate process (:class:`Workshop`). It has the methods of :class:`SandboxPool`.
 
     Parameters
     ----------
@@ -409,7 +409,7 @@ class Errand:
                 yield from self._box.replies(question)
 
     def cancel(self, _key: str = "") -> bool:
-        """Stop the task, or prevent its start."""
+        """Stop the task. If it has not started yet, prevent its start."""
         self._gone = True
         if self._box is not None:
             self._box.stop()
@@ -472,7 +472,7 @@ class SandboxPool:
         self.close()
 
     def close(self) -> None:
-        """Stop all sandbox processes of the pool, also during a query."""
+        """Stop all sandbox processes of the pool, even if a query runs."""
         with self._changed:
             self._closed = True
             boxes = [*self._free, *(box for box in self._asked.values() if box is not None)]
@@ -485,7 +485,7 @@ class SandboxPool:
             box.close()
 
     def ask(self, question: Mapping[str, object], key: str) -> Iterator[dict[str, Any]]:
-        """Run a query in a free sandbox process, and yield its replies on arrival.
+        """Run a query in a free sandbox process, and yield each reply as soon as it arrives.
 
         Parameters
         ----------
@@ -509,7 +509,7 @@ class SandboxPool:
                 self._asked.pop(key, None)
 
     def cancel(self, key: str) -> bool:
-        """Stop the query with a key, and return True. False means that no running query has this key."""
+        """Stop the running query with this key. Return False if there is no such query."""
         with self._changed:
             box = self._asked.pop(key, None)
             known = box is not None or key in self._asked
@@ -544,7 +544,7 @@ class SandboxPool:
         self._ready(box)
 
     def _ready(self, box: Sandbox) -> None:
-        """Run the first query of a new sandbox process, and add the process to the pool."""
+        """Warm up a new sandbox process with a first query, then add the process to the pool."""
         with suppress(SgstoreError):
             if self._first is not None:
                 box.ask(self._first)
@@ -599,7 +599,7 @@ def serve(answering: Answering) -> None:
 
 
 def rows_found(store: Store, question: dict[str, Any], most: int) -> dict[str, Any]:
-    """Return the rows of an SQL statement or a pattern query as JSON values, with a flag for more rows."""
+    """Run an SQL statement or a pattern query. Return its rows as JSON values, and True if there are more."""
     graphs, notes = False, ()
     if "sql" in question:
         rows = store.sql(question["sql"], max_rows=most)
@@ -617,7 +617,7 @@ def rows_found(store: Store, question: dict[str, Any], most: int) -> dict[str, A
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON values: lists, dictionaries, numbers and texts."""
+    """Convert a value to JSON values: lists, dictionaries, numbers and texts."""
     if isinstance(value, (list, tuple)):
         return [plain(item) for item in value]  # pyright: ignore[reportUnknownVariableType]
     if isinstance(value, dict):
@@ -634,7 +634,7 @@ def _refusal(error: SgstoreError) -> dict[str, Any]:
 
 
 def _spilled(error: SgstoreError) -> bool:
-    """True if the cause of an error is a temporary file of the database, which the sandbox forbids."""
+    """True if the database failed because the sandbox forbids temporary files."""
     text = str(error)
     return os.strerror(errno.EFBIG) in text and "duckdb_temp" in text
 

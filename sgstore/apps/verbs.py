@@ -1,4 +1,4 @@
-"""Functions behind the methods of :class:`sgstore.query.StoreVerbs`; the command line uses them, too."""
+"""Functions that implement the methods of :class:`sgstore.query.StoreVerbs` and the command line."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def one_store(store: Store | Collection) -> Store:
 def chosen_frames(
     store: Store | Collection, query: str, parameters: Mapping[str, object] | None, name: str = ""
 ) -> ChosenFrames:
-    """Return the frames that a command works on: the matches of a query, or all frames."""
+    """Return the frames for a command: frames that match a query, or all frames without a query."""
     from sgstore.testsets.coverage import ChosenFrames, frames_of
 
     name = name or (str(store.file.path) if isinstance(store, Store) else store.place.url)
@@ -246,7 +246,7 @@ def coverage(  # noqa: PLR0913 - the options of the command
 
 
 def listed(found: Any, *, missing: bool, covered: bool) -> ReportTable:
-    """Return the missing or the covered items of a coverage, or by default its shares.
+    """Return one table of a coverage: the missing items, the covered items, or by default the shares.
 
     ``found``: the three tables shares, covered, missing; or an object with these attributes.
     """
@@ -266,7 +266,7 @@ def class_tables(  # noqa: PLR0913 - the options of the commands
     by_frame: bool = False,
     depth: int = 4,
 ) -> tuple[ReportTable, ...]:
-    """Return the tables of class coverage: one table, or for ``explain`` the features and a decision tree.
+    """Return tables of class coverage: features and a decision tree for ``explain``, otherwise one table.
 
     Parameters
     ----------
@@ -318,7 +318,7 @@ def compared(
     by_frame: bool,  # noqa: FBT001 - named by the callers
     abstraction: str,
 ) -> ReportTable:
-    """Return the differences of two selections of frames: their scenes, or the results of a statement."""
+    """Compare two selections of frames. Return different scenes, or different results of a statement."""
     from sgstore.testsets import diff as differences
     from sgstore.testsets.coverage import classed
 
@@ -341,7 +341,7 @@ def timeline(
     to: str | Path | None,
     parameters: Any,
 ) -> list[Timeline]:
-    """Return lanes of matches and violations; see :meth:`sgstore.query.StoreVerbs.timeline`."""
+    """Return timelines of matches and violations; see :meth:`sgstore.query.StoreVerbs.timeline`."""
     from sgstore.draw import draw_timelines, timelines
 
     found = timelines(one_store(store), by_lane(queries, parameters or {}), traces)
@@ -353,7 +353,7 @@ def timeline(
 def by_lane(
     queries: Sequence[str], parameters: Mapping[str, Any], files: Mapping[str, str] | None = None
 ) -> dict[str, tuple[str, Mapping[str, object]]]:
-    """Return the queries of a timeline by the names of their lanes, with the values of their parameters.
+    """For each lane of a timeline, return its query and the values of its parameters, by lane name.
 
     Parameters
     ----------
@@ -394,7 +394,7 @@ def by_lane(
 
 
 def free_name(name: str, longer: str, taken: Container[str]) -> str:
-    """Return a name that is not taken: the name, a longer one, or that with a number."""
+    """Return a free name: the short one, else the longer one, else the longer one with a number."""
     if name not in taken:
         return name
     numbered = (f"{longer} ({number})" for number in count(2))
@@ -501,7 +501,7 @@ def lock(
     payloads: bool,
     progress: Callable[[int, int], None] | None = None,
 ) -> Lock:
-    """Return the lock of some cases; see :meth:`sgstore.query.StoreVerbs.lock`."""
+    """Return a lock of test cases; see :meth:`sgstore.query.StoreVerbs.lock`."""
     from sgstore.testsets.selection import (
         Selection,
         locked_order,

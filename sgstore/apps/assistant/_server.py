@@ -95,7 +95,7 @@ class StoreTool(Tool):
     """Tool that also accepts usual other names of its arguments, and explains each wrong argument."""
 
     async def run(self, arguments: dict[str, Any], *rest: Any, **named: Any) -> Any:
-        """Run the tool with arguments; see :meth:`Tool.run`."""
+        """Run the tool with the arguments of a call; see :meth:`Tool.run`."""
         known: dict[str, Any] = self.parameters.get("properties", {})
         taken, wrong = _renamed(arguments, known)
         missing = [name for name in self.parameters.get("required", ()) if name not in taken]
@@ -116,7 +116,7 @@ class StoreTool(Tool):
 
 
 def _renamed(arguments: dict[str, Any], known: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
-    """Return the arguments with the names of the tool, and a sentence for each unknown argument."""
+    """Rename arguments that an assistant calls by other names. Return an error text for each unknown one."""
     taken = {name: value for name, value in arguments.items() if name in known}
     wrong: list[str] = []
     for name, value in arguments.items():
@@ -146,7 +146,7 @@ def _tool(name: str, tool: Callable[..., ToolAnswer]) -> Tool:
 
 
 def _untitled(schema: Any) -> Any:
-    """Return a JSON schema without titles, which only repeat the names of fields."""
+    """Return a JSON schema without the titles of fields, because they only repeat the names of fields."""
     if isinstance(schema, dict):
         every: dict[str, Any] = schema
         kept = {n: v for n, v in every.items() if not (n == "title" and isinstance(v, str))}
@@ -158,7 +158,7 @@ def _untitled(schema: Any) -> Any:
 
 
 def _told(tool: Callable[..., ToolAnswer]) -> Callable[..., CallToolResult]:
-    """Wrap a tool as a function of the MCP server. An error becomes a result with its message."""
+    """Convert a tool to a function of the MCP server. Errors of the library become error results."""
 
     @wraps(tool)
     def told(*values: Any, **named: Any) -> CallToolResult:

@@ -91,12 +91,12 @@ class ToolAnswer:
 
 @dataclass(frozen=True)
 class KnownBindings:
-    """Bindings of a query in one frame, computed in the sandbox, to mark the matches in a picture."""
+    """Matches of a query in one frame, computed in the sandbox. A picture marks their nodes."""
 
     found: list[dict[str, int]]
 
     def bindings(self, frame: FrameRef) -> list[dict[str, int]]:
-        """Return the node ids by variable name, for each match in the frame."""
+        """For each match in the frame, return its nodes: variable name → node id."""
         del frame
         return self.found
 
@@ -420,7 +420,7 @@ class StoreTools:
         return ToolAnswer(f"{about['frame']}, {topic}: {size}", about, image, "image/jpeg")
 
     def _from_start(self, row: dict[str, Any]) -> dict[str, Any]:
-        """Return the row of a clip with its start in seconds since the start of its trace, like other tools."""
+        """Return the row of a clip. Its start time becomes seconds since the start of its trace."""
         if "start_ns" not in row:
             return row
         began = self._store.file.frame(f"{row['trace']}@0s").log_time_ns
@@ -428,7 +428,7 @@ class StoreTools:
         return dict(times.get(name, (name, value)) for name, value in row.items())
 
     def _drawn(self, draw: Callable[[Path], None]) -> bytes:
-        """Return the PNG picture that a function draws into a temporary file."""
+        """Call a function that draws a PNG picture into a file. Return the content of the file."""
         with self._turn, tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "drawn.png"
             draw(file)
@@ -577,7 +577,7 @@ def _rows_text(reply: Mapping[str, Any]) -> str:
 
 
 def _lines(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> tuple[list[str], int]:
-    """Return a header and the rows that fit, as lines of text. Also return the number of these rows."""
+    """Return a header and as many rows as fit, as lines of text. Also return the number of these rows."""
     lines = [" | ".join(columns)]
     left = MOST_TEXT
     for number, row in enumerate(rows):
@@ -590,7 +590,7 @@ def _lines(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> tuple[list[
 
 
 def _remarks(reply: Mapping[str, Any]) -> list[str]:
-    """Return sentences about the traces that cannot answer a query, and about likely mistakes in the query."""
+    """Return sentences that name the traces that cannot answer a query, and its likely mistakes."""
     of: dict[str, list[str]] = {}
     for name, reason in reply.get("left_out", {}).items():
         of.setdefault(reason, []).append(name)

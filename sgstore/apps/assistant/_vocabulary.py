@@ -86,7 +86,7 @@ def _topics(known: Mapping[str, Any]) -> str:
 
 
 def _ends(relations: Mapping[str, tuple[list[str], list[str]]]) -> list[str]:
-    """Return text lines with the source and target kinds of relations, one line for equal kinds."""
+    """Return lines of text: relations, with the kinds of their source and target nodes."""
     alike: dict[str, list[str]] = {}
     for name, (sources, targets) in relations.items():
         alike.setdefault(f"{', '.join(sources)} → {', '.join(targets)}", []).append(name)
@@ -150,7 +150,7 @@ def _predicates() -> str:
 
 
 def _views(views: Mapping[str, Any], word: str) -> str:
-    """Return one view with its columns, or the first sentence on each view that has the word.
+    """Return a description of one view; or of each view that contains the word, its first sentence.
 
     Columns with the word follow the sentence.
     """

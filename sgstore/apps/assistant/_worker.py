@@ -47,7 +47,7 @@ _OF_TRACES: Final = {"find", "check"}
 def _listed(
     columns: Sequence[str], rows: Iterable[Sequence[Any]], limit: int, **about: Any
 ) -> Reply:
-    """Return a reply with the rows up to a limit, and the number of all rows."""
+    """Return a reply with at most ``limit`` rows, and the number of all rows."""
     some = iter(rows)
     found = list(islice(some, limit))
     total = len(found) + sum(1 for _ in some)
@@ -57,7 +57,7 @@ def _listed(
 def _listed_first(
     columns: Sequence[str], rows: Iterable[Sequence[Any]], limit: int, **about: Any
 ) -> Reply:
-    """Return a reply with the rows up to a limit. Other rows are not read."""
+    """Return a reply with at most ``limit`` rows. At most one more row is read."""
     found = list(islice(rows, limit + 1))
     return _cut(columns, found[:limit], truncated=len(found) > limit) | about
 
@@ -67,7 +67,7 @@ def _cut(columns: Sequence[str], rows: Sequence[Sequence[Any]], *, truncated: bo
 
 
 def _named(text: str, parameters: Mapping[str, Any], *, check: bool) -> tuple[str, dict[str, Any]]:
-    """Return the text of a query, or of a named library pattern, with the values of its parameters.
+    """Return the text of a query and the values of its parameters. The text may name a library pattern.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def _named(text: str, parameters: Mapping[str, Any], *, check: bool) -> tuple[st
 def _found(
     store: Store, text: str, parameters: Mapping[str, Any]
 ) -> tuple[Matches, dict[str, Any]]:
-    """Return the matches of a query, and a dict of traces without an answer and of notes on mistakes."""
+    """Return the matches of a query. Also return traces that cannot answer it, and likely mistakes."""
     asked, values = _named(text, parameters, check=False)
     matches = store.find(asked, **values)
     return matches, {"left_out": matches.reasons, "notes": matches.notes}
@@ -235,7 +235,7 @@ def _shares(
 
 
 def _chosen(store: Store, query: str) -> ChosenFrames:
-    """Return the frames of a query; without a query, those of the whole store."""
+    """Return the frames that match a query; all frames of the store if the query is empty."""
     from sgstore.testsets.coverage import ChosenFrames, frames_of
 
     if not query:

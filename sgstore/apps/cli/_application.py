@@ -1,4 +1,4 @@
-"""Start of the command line: registration of commands, exit codes, messages of errors and interruptions."""
+"""Start of the command line: it registers the commands, returns exit codes, and prints errors."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ for _group, _panel in (
 
 
 def _verb_in(arguments: Sequence[str]) -> Sequence[str]:
-    """Return a list with the command name of a command line, or an empty list without a command."""
+    """Return the first word of a command line that is not ``--quiet`` or ``--verbose``, as a list."""
     return [text for text in arguments if text not in {"--quiet", "--verbose"}][:1]
 
 

@@ -157,7 +157,7 @@ def _read(file: Path) -> None:
 
 @dataclass(frozen=True)
 class ReportFiles:
-    """Report files that ``check`` writes for other programs, and the data for them.
+    """Paths of the report files that ``check`` writes for other programs, and the data for them.
 
     Attributes
     ----------
@@ -285,7 +285,7 @@ _DOCUMENT: Final = (
 
 
 def _document(verdict: Verdict, returned: Sequence[str]) -> tuple[Any, ...]:
-    """Return a verdict of a check as a row for JSON output, with its violations and entities."""
+    """Return the verdict of a check as a row for JSON output; violations and entities are included."""
     spans = [_span(one, returned) for one in verdict.violations]
     witnesses = [
         {
@@ -301,7 +301,7 @@ def _document(verdict: Verdict, returned: Sequence[str]) -> tuple[Any, ...]:
 
 
 def margin_document(verdict: Verdict) -> dict[str, Any] | None:
-    """Return the robustness margin of a verdict as a dictionary for JSON. Infinite numbers become ``None``."""
+    """Return the robustness margin of a verdict for JSON, as a dictionary. Infinite numbers become ``None``."""
     found = verdict.robustness
     if found is None:
         return None

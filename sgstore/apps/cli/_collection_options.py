@@ -75,7 +75,7 @@ class CollectionOptions:
 
 
 def shown_bundle(bundle: str, out: PrintedRows) -> str:
-    """Return the name of a bundle as shown in tables (12 digits), or in full for programs."""
+    """Return the name of a bundle: its first 12 digits for text tables, in full for other formats."""
     return bundle[:12] if out.for_people else bundle
 
 
@@ -83,7 +83,7 @@ _collections: Final[list[Any]] = []  # Collection
 
 
 def note_collection(store: Store | Collection) -> None:
-    """Record the collection that the command uses, so that its missing bundles can be reported at the end."""
+    """Remember the collection that a command uses, to report its missing bundles at the end."""
     if hasattr(store, "missing"):
         whole: Any = store
         _collections.append(whole)

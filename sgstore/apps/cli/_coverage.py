@@ -92,7 +92,7 @@ class WindowOptions:
 
 @dataclass(frozen=True)
 class SceneOptions(WindowOptions):
-    """Command line options that define the classes of frames, by their graphs or by declared slots."""
+    """Command line options that define the classes of frames: by scene graph, or by declared slots."""
 
     slots: Path | None = None
 
@@ -100,7 +100,7 @@ class SceneOptions(WindowOptions):
 def _report_scenes(
     table: ReportTable, frames: Classed, ask: FrameAskOptions, limit: int | None
 ) -> None:
-    """Print a table of frames. In text output, each row also describes the scene in words."""
+    """Print a table of frames. A text table also has a description of each scene in words."""
     from sgstore.testsets.scenes import with_scenes
 
     ask.report(with_scenes(table, frames.chosen.store) if ask.for_people else table, limit)
@@ -398,7 +398,7 @@ def _fraction(text: str) -> float:
 def _report_below(
     shares: ReportTable, listed: ReportTable, ask: FrameAskOptions, limit: int | None
 ) -> None:
-    """Print a table, and below it the notes of a second table of shares that is not printed."""
+    """Print a table of items. First print the notes of the table of shares, which is not printed itself."""
     for text in shares.said if listed is not shares else ():
         say(text)
     ask.report(listed, limit)
@@ -413,7 +413,7 @@ def _report_slots(
     limit: int | None,
     picture: Path | None,
 ) -> None:
-    """Print one table about declared slots, and draw the pairs of their values if requested."""
+    """Print a coverage table of declared slots. If a picture is requested, draw the pairs of slot values."""
     from sgstore.apps.verbs import listed
     from sgstore.testsets.coverage import Specification, slot_coverage
 

@@ -110,7 +110,7 @@ def export(
 
 
 def _write(written: Sequence[WrittenClip | WrittenFile], out: PrintedRows) -> None:
-    """Print one row for each written clip or file, and report lost messages."""
+    """Print a row for each written clip or file. Report lost messages."""
     _say_lost(written)
     rows = [one.as_row() for one in written]
     out.write(tuple(rows[0]), [tuple(row.values()) for row in rows])
@@ -184,7 +184,7 @@ def shrink(
 def _cut_out(
     store: Store, clips: list[Clip], text: str, to: Path
 ) -> dict[Clip, WrittenClip | WrittenFile]:
-    """Write clips from their recordings, report lost messages, and return the written files by clip."""
+    """Cut clips out of their recordings, and report lost messages. Return the written file of each clip."""
     from sgstore.exporters import Export, write_export
 
     with count_bar(to.name or "shrink", "clips") as progress:
@@ -225,7 +225,7 @@ class DrawOptions:
     fps: Annotated[float, Option(min=0.1, max=50.0)] = 10.0
 
     def options(self, matches: Matches | None) -> dict[str, Any]:
-        """Return the drawing options as keyword arguments, without those of animations."""
+        """Return the drawing options for a single picture as keyword arguments."""
         options = asdict(self)
         del options["fps"]
         return {"matches": matches, **options}

@@ -22,13 +22,13 @@ _NO_XML: Final = re.compile(r"[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U001
 
 
 def clip_of(span: Interval) -> str:
-    """Return the frames of a violation as a clip: ``town#120..160``."""
+    """Return the name of a clip with the frames of a violation, such as ``town#120..160``."""
     return f"{span.trace}#{span.start_seq}..{span.end_seq}"
 
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """Evidence of violations: the command that shows a violation, and its picture.
+    """Evidence for violations in reports: a command that shows the violation, and a picture.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class Evidence:
     pictures: Mapping[str, str] = field(default_factory=dict[str, str])
 
     def of(self, span: Interval) -> dict[str, str]:
-        """Return the clip, the command and the picture of one violation."""
+        """Return the clip of a violation, the command that shows it, and its picture if there is one."""
         clip = clip_of(span)
         show = ["sgstore", "show", self.store, f"{span.trace}#{span.start_seq}"]
         found = {"clip": clip, "command": shlex.join(show)}
@@ -94,7 +94,7 @@ def write_junit(path: Path, verdicts: Iterable[Verdict], evidence: Evidence) -> 
 
 
 def _word(verdict: Verdict) -> str:
-    """Return the verdict of a check as a word for a report, without its reason."""
+    """Return the verdict of a check as text for a report, without its reason."""
     return (
         "pending at the end of the recording" if verdict.verdict == "pending" else verdict.verdict
     )

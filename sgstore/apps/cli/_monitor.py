@@ -121,7 +121,7 @@ def monitor(
 
 
 def _sensors(file: Path | None, *, shown: bool) -> list[Sensor]:
-    """Return the CARLA sensors that a file lists. Without a live page to show them, they raise an error."""
+    """Return the CARLA sensors listed in a file. Raise an error if no live page shows them."""
     from sgstore.readers import load_sensors
 
     if file is not None and not shown:
@@ -137,7 +137,7 @@ def _run_with_page(
     longest: float | None,
     port: int,
 ) -> tuple[Monitor, tuple[Verdict, ...]]:
-    """Run a monitor and serve its live page until both have ended; return the monitor and the verdicts."""
+    """Run a monitor and serve its live page. Return the monitor and the verdicts when both have ended."""
     from sgstore.apps.explorer import LiveRun, serve_live
     from sgstore.temporal import paced
 

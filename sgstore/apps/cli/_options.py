@@ -107,7 +107,7 @@ if TYPE_CHECKING:
 
 
 class Verb(TyperCommand):
-    """Command of ``sgstore`` that rejects a repeated option, unless the option collects several values."""
+    """Command of ``sgstore``. It rejects an option that occurs twice, except options with several values."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments of a command, and return the unparsed ones."""
@@ -154,7 +154,7 @@ def _path_of(ctx: Any) -> str:
 
 
 def library_help(path: str) -> dict[str, str]:
-    """Return the descriptions of the parameters of the library's method for a command, by name."""
+    """Return the help texts of a command's parameters from the library method with the same name."""
     from sgstore.query import Store  # only for help
 
     words = (word for word in path.split() if word not in _GROUPS)
@@ -186,7 +186,7 @@ OLD_WORDS: Final[dict[str, dict[str, str]]] = {
 
 
 def renamed(verb: Verb, ctx: Any, args: list[str]) -> list[str]:
-    """Return the arguments of a command with old options replaced by new ones. Print a note for each."""
+    """Return the arguments of a command; old names of options are replaced. Print a note for each old name."""
     known = {word for one in verb.params for word in (*one.opts, *one.secondary_opts)}
     words = {old: new for old, new in OLD_WORDS[""].items() if new in known}
     words |= OLD_WORDS.get(_path_of(ctx), {})
@@ -204,7 +204,7 @@ def renamed(verb: Verb, ctx: Any, args: list[str]) -> list[str]:
 
 
 def _means_files(path: str, args: Sequence[str]) -> bool:
-    """True if ``--format`` in an old command line means the format of written files, not of printed rows."""
+    """True if an old ``--format`` selects the format of written files; False for the format of printed rows."""
     if any(one == "--as" or one.startswith("--as=") for one in args):
         return False
     values = [value for name, value in pairwise(args) if name == "--format"]
@@ -217,7 +217,7 @@ _TYPES: Final = {"str": "text", "Path": "path", "int": "number", "float": "numbe
 
 
 def _show_plainly(parameter: Any, ctx: Any) -> None:
-    """Set the placeholder of a parameter in the help. Flags get none, and Python types are not shown."""
+    """Set how the help shows the value of a parameter: a placeholder, not a Python type; nothing for flags."""
     if getattr(parameter, "is_flag", False):
         parameter.metavar = ""
     kind = parameter.display_type(ctx).strip("<>").removeprefix("list[").removesuffix("]")
@@ -234,7 +234,7 @@ def examples() -> dict[str, list[str]]:
 
 
 def _write_examples(ctx: Any) -> None:
-    """Print the examples of a command without a frame and line breaks, so that users can copy them."""
+    """Print the examples of a command as plain lines without a frame, so that users can copy them."""
     lines: list[str] = []
     for one in examples().get(ctx.command_path.partition(" ")[2], ()):
         typed, _, purpose = one.rpartition("  # ")
@@ -243,7 +243,7 @@ def _write_examples(ctx: Any) -> None:
 
 
 def _with_store(verb: Verb, ctx: Any, args: list[str]) -> list[str]:
-    """Return the arguments of a command. A missing store is taken from ``SGSTORE_STORE``.
+    """Return the arguments of a command. If the store is missing, insert the value of ``SGSTORE_STORE``.
 
     The first argument is a store if it looks like one, or if the number of arguments is complete.
     """
@@ -276,7 +276,7 @@ def _looks_like_store(place: str) -> bool:
 
 
 def _advise(error: Any, verb: Verb, ctx: Any, args: list[str]) -> None:
-    """Add a remedy to the message of a usage error: the right option, or the right position of the store."""
+    """Add advice to the message of a usage error, such as the right option."""
     name = getattr(error, "option_name", "")
     if type(error).__name__ == "NoSuchOption" and (line := _option_instead(verb, ctx, args, name)):
         error.possibilities = None
@@ -292,7 +292,7 @@ def _advise(error: Any, verb: Verb, ctx: Any, args: list[str]) -> None:
 
 
 def _several_stores(ctx: Any, stores: Sequence[str]) -> str:
-    """Return the message for several stores in a command line that takes one: make a collection of them."""
+    """Return an error message for several stores where one is expected. It shows how to make a collection."""
     lines = [shlex.join(["sgstore", "collection", "pack", one, "fleet"]) for one in stores]
     each = " --each" if _path_of(ctx) == "sql" else ""
     lines.append(f"{ctx.command_path} fleet{each} …")
@@ -365,7 +365,7 @@ class Group(TyperGroup):
     _shows_options = True
 
     def get_params(self, ctx: Any) -> list[Any]:
-        """Return the options of the group. While the help lists its commands, return none."""
+        """Return the options of the group; an empty list while the help of the group is written."""
         return super().get_params(ctx) if self._shows_options else []
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
@@ -425,7 +425,7 @@ _OPTIONS_OF_STORE: Final = {"-o", "--to", "--output", "--store", "-s", "--db", "
 
 
 def _option_instead(verb: Verb, ctx: Any, args: list[str], name: str) -> str:
-    """Return a command line with the right option for an unknown one; an empty text if none is similar."""
+    """If an option is unknown, return a command line with a similar option; empty if none is similar."""
     known = sorted({word for one in verb.params for word in (*one.opts, *one.secondary_opts)})
     others = [new for new, words in _OPTIONS_OF_OTHERS.items() if name in words and new in known]
     if name in _OPTIONS_OF_STORE and name in args[:-1] and _places(verb):
@@ -443,7 +443,7 @@ _USUAL: Final = {"coverage": "classes", "collection": "verify", "patterns": "run
 
 
 def _command_instead(group: TyperGroup, ctx: Any, args: list[str]) -> str:
-    """Return the right command line for an unknown command; an empty text if no command is similar."""
+    """If a command is unknown, return a command line with a similar command; empty if none is similar."""
     (word, *rest), path = args, ctx.command_path.partition(" ")[2]
     place = _looks_like_store(word) or Path(word).suffix in {".mcap", ".osi", ".log", ".lock"}
     if path and not place:
@@ -515,7 +515,7 @@ _hints = cache(partial(get_type_hints, include_extras=True))
 
 
 def _unbundled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function with plain parameters for typer: a dataclass parameter becomes one parameter per field.
+    """Convert a function for typer: each dataclass parameter is replaced by one parameter per field.
 
     Docstrings describe the options: the section *Parameters* has a name, a placeholder such as
     ``TIME`` if the help needs one, and the help.
@@ -643,7 +643,7 @@ class PrintedRows:
 
     @property
     def file(self) -> Path | None:
-        """Return the output file for result rows; ``None`` means stdout."""
+        """Return the output file for result rows, or ``None`` for stdout."""
         return getattr(self, "to", None)
 
     @property
@@ -778,7 +778,7 @@ class Question:
         return bool(self.query or self.file or self.name)
 
     def typed(self) -> str:
-        """Query as the user typed it: its text, the text of its file, or its name. Empty without a query."""
+        """Query as the user typed it, or the name of a library pattern; empty if there is none."""
         if sum(source is not None for source in (self.query, self.file, self.name)) > 1:
             raise typer.BadParameter("expected one of: a query, -f FILE, -p NAME")
         return (self.name or query_of(self.query, self.file)) if self else ""
@@ -807,7 +807,7 @@ class Statements:
     sgsm_compat: bool = False
 
     def asked(self, given: Sequence[str] | None) -> tuple[dict[str, list[str]], dict[str, Any]]:
-        """Return the statements by source (arguments, library, options), and the values of their parameters.
+        """Return the statements of the command by name, and the values of their parameters.
 
         Returns
         -------
@@ -839,7 +839,7 @@ class Statements:
 
 @dataclass(frozen=True)
 class GraphOptions:
-    """Command line options that select the settings of the scene graphs: a file or a preset.
+    """Command line options that select a file or a preset with the settings of the scene graphs.
 
     Parameters
     ----------
@@ -853,7 +853,7 @@ class GraphOptions:
     preset: Annotated[str | None, Option(autocompletion=completion.presets)] = None
 
     def settings(self) -> Config | None:
-        """Return the scene graph settings of ``--config`` or ``--preset``.
+        """Return the scene graph settings that ``--config`` or ``--preset`` selects.
 
         ``None`` means that neither is given.
         """
@@ -914,7 +914,7 @@ def form_of(form: Format, output: Path | None = None, *, as_json: bool) -> Forma
 
 
 def tables_of(given: list[str] | None) -> dict[str, Path]:
-    """Return files by table name from the option ``--with``: ``NAME=FILE``, or a file named like its table."""
+    """Return the files of the option ``--with`` by table name. Without ``NAME=``, the file names the table."""
     tables: dict[str, Path] = {}
     for text in given or []:
         name, equals, path = text.partition("=")
@@ -951,7 +951,7 @@ def named_and_texts(arguments: Iterable[str]) -> tuple[list[str], list[str]]:
 
 
 def text_or_file(argument: str) -> str:
-    """Return the text of a file if an argument is ``-`` or the name of a file, else the argument itself."""
+    """If an argument is ``-`` or the name of a file, return the text of the file; otherwise the argument."""
     path = Path(argument)
     found = _is_file(path)
     named = path.suffix in {".sgql", ".sql", ".txt"} and not re.search(r"\s", argument)
@@ -1066,7 +1066,7 @@ def say_scope(found: Mapping[str, Any], chosen: Format) -> None:
 
 
 def say_unknown(told: Iterable[tuple[str, str, str]]) -> None:
-    """Print the parts of a query whose values are unknown, with trace and reason."""
+    """Print which parts of a query have an unknown value, with the trace and the reason."""
     from sgstore.temporal import unknown_notes
 
     for note in unknown_notes((f"{name} is unknown", trace, why) for name, trace, why in told):

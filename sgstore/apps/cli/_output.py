@@ -32,7 +32,7 @@ T = TypeVar("T")
 
 
 def progress(items: Sequence[T], noun: str) -> Iterator[T]:
-    """Yield the items. On a terminal, show on stderr how many are done."""
+    """Yield the items. On a terminal, show a progress bar on stderr."""
     from rich.console import Console
     from rich.progress import track
 
@@ -42,7 +42,7 @@ def progress(items: Sequence[T], noun: str) -> Iterator[T]:
 
 @contextmanager
 def ingest_bar() -> Generator[Callable[[Progress], None] | None]:
-    """Yield a function that shows the progress of an ingest on stderr; ``None`` without a terminal."""
+    """Yield a function that shows the progress of an ingest; ``None`` if stderr is quiet or not a terminal."""
     if quiet() or not sys.stderr.isatty():
         yield None
         return
@@ -80,7 +80,7 @@ def ingest_bar() -> Generator[Callable[[Progress], None] | None]:
 
 @contextmanager
 def count_bar(what: str, things: str) -> Generator[Callable[[int, int], None] | None]:
-    """Yield a function that shows a count on a progress bar; ``None`` if stderr is not a terminal."""
+    """Yield a function that shows a count on a progress bar; ``None`` if stderr is quiet or not a terminal."""
     if quiet() or not sys.stderr.isatty():
         yield None
         return
@@ -357,7 +357,7 @@ def _json_value(value: Any, name: str = "") -> Any:
 
 
 def write_binary(write: Callable[[Path], int], form: Format, output: Path | None) -> int:
-    """Write result rows as Parquet or Arrow, and return their number. The memory is bounded.
+    """Write result rows as Parquet or Arrow, in bounded memory. Return the number of rows.
 
     Parameters
     ----------
@@ -427,7 +427,7 @@ class _TableColumn:
     most: int = 0
 
     def text(self, cell: str) -> str:
-        """Return a table cell, cut to the column width. Paths keep both ends, and numbers are not cut."""
+        """Return the text of a cell, cut to the column width. Paths keep both ends; numbers are not cut."""
         room = self.most or self.width
         if len(cell) > room and not (self.right or self.whole):
             end = (room - 1) * 2 // 3 if self.name in _PATHS else 0
@@ -643,7 +643,7 @@ def _amount(size: int) -> str:
 
 
 def _shown(text: str) -> str:
-    """Return a text with unprintable characters replaced, because they could control the terminal."""
+    """Replace unprintable characters of a text, because they could control the terminal."""
     if text.isprintable():  # nearly every cell of a long table
         return text
     return "".join(c if c.isprintable() else "�" for c in text)

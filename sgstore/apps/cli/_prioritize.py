@@ -58,7 +58,7 @@ def criticality(
 
 @dataclass(frozen=True)
 class OrderOptions:
-    """Command line options for the order of test cases: its rule, and the unit (frame, clip or trace)."""
+    """Command line options for the order of test cases: the rule of the order, and what a test case is."""
 
     order: Literal["risk", "diverse", "both", "learned"] = "risk"
     measures: Annotated[
@@ -73,7 +73,7 @@ class OrderOptions:
 
 @dataclass(frozen=True)
 class OutcomeOptions:
-    """Command line options for known test results, from which an order is learned or rated.
+    """Command line options for files of known test results. An order is learned from them, or rated.
 
     Parameters
     ----------

@@ -42,7 +42,7 @@ _ENDS: Final = tuple(
 
 @dataclass(slots=True)
 class _RunEnd:
-    """Reason why a command ends early (signal or deadline), and the earlier hook for unraisable errors."""
+    """Early end of the command: the received signal, or the deadline and whether it has passed."""
 
     signal: int = 0
     deadline_s: float = 0.0
@@ -83,7 +83,7 @@ def _hear_of_lost() -> None:
 
 
 def _lost(report: Any) -> None:
-    """Handle an exception that Python could not raise. A lost keyboard interrupt is raised again later."""
+    """Handle an exception that Python could only report. A keyboard interrupt is raised again soon after."""
     if not issubclass(report.exc_type, KeyboardInterrupt):
         _run.reported(report)
         return
@@ -121,7 +121,7 @@ def _too_late(_number: int, _frame: FrameType | None) -> None:
 
 
 def was_ended() -> bool:
-    """True if a signal or the deadline ended the command, even if Python lost the exception."""
+    """True if a signal or the deadline has ended the command, even if Python lost the exception."""
     return bool(_run.signal) or _run.late
 
 
@@ -172,7 +172,7 @@ def take_streams() -> None:
 
 
 def _occupy() -> None:
-    """Open closed file descriptors 0 to 2, so that no other file becomes a standard stream by mistake."""
+    """Open /dev/null for each closed standard stream, so that no other file gets its number."""
     descriptor = os.open(os.devnull, os.O_RDONLY)  # writes to it fail, as to a closed stream
     while descriptor < 3:
         descriptor = os.dup(descriptor)

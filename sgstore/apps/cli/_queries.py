@@ -142,7 +142,7 @@ def find(
 
 
 def _with_names(text: str) -> str:
-    """Return a query that returns node names instead of ids, or the same query if its rows would change."""
+    """Return a query that returns names of nodes, not ids; the same query if that would change its rows."""
     from sgstore.lang.syntax import parse
     from sgstore.lang.syntax.tree import AttributeOf, MatchClause, Variable
 
@@ -168,7 +168,7 @@ def _with_names(text: str) -> str:
 
 
 def _say_absent(matches: Matches, number: int) -> None:
-    """Print the part of the pattern that no frame of the store has, if nothing matches."""
+    """If a query has no matches, print why, such as a part of the pattern that occurs in no frame."""
     if not number and not matches.mistakes:
         say_notes(matches.notes)
 
@@ -184,7 +184,7 @@ def _returns_nothing(text: str) -> bool:
 
 
 def _write_stretches(intervals: Iterator[Interval], ask: AskOptions) -> int:
-    """Print intervals of matching frames and their total, and return the number of intervals."""
+    """Print intervals of matching frames, and their total length. Return the number of intervals."""
     traces: set[str] = set()
     frames, seconds = 0, 0.0
 
@@ -226,7 +226,7 @@ def _write_parted(
 
 
 def _ended(number: int, ask: AskOptions, *, require: bool) -> int:
-    """Return the exit code for a number of result rows. On a terminal, report that nothing matches."""
+    """Return the exit code for a number of matches. On a terminal, report that nothing matches."""
     if not number and ask.for_people:
         say("nothing matches")
     return NO_MATCH if require and not number else 0
@@ -235,7 +235,7 @@ def _ended(number: int, ask: AskOptions, *, require: bool) -> int:
 def _as_shown(
     answer: Matches | Answer, rows: Iterable[tuple[Any, ...]], form: Format
 ) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
-    """Return the columns and rows of a query in the form that an output format needs.
+    """Return the columns and rows of a query result in the form that an output format needs.
 
     Tables get readable names of entities. JSON gets graphs in the node-link form of networkx.
     """
@@ -344,7 +344,7 @@ _FEATURES_SHOWN: Final = 3
 
 
 def _differing(features: dict[str, int]) -> str:
-    """Return differing features with their counts as text: the first ones, and the number of the others."""
+    """Return a text with the first few differing features, their counts, and the number of the others."""
     shown = [f"{n} x {text}" if n > 1 else text for text, n in features.items()]
     more = shown[_FEATURES_SHOWN:]
     return ", ".join([*shown[:_FEATURES_SHOWN], *([f"… {len(more)} more"] if more else [])])
@@ -686,7 +686,7 @@ def _told(found: NamedPattern) -> dict[str, Any]:
 
 
 def _for_people(found: NamedPattern) -> str:
-    """Return a library pattern as query text with default parameters and explanatory comments."""
+    """Return a library pattern as query text. Comments explain the pattern and its default parameters."""
     head = [f"{found.name}: {found.sentence}", f"source: {found.source}"]
     head += [f"param {p.name} = {p.default}: {p.meaning}" for p in found.parameters.values()]
     head += ["", *found.example.splitlines()] if found.example else []

@@ -151,14 +151,14 @@ def _report_outcomes(outcomes: list[TraceOutcome], out: PrintedRows) -> int:
 
 
 def _taken_name(outcome: TraceOutcome) -> str:
-    """Return the name of a file that another trace of the store has; empty if the trace has its name."""
+    """If a trace was renamed because its name was taken, return the taken name; otherwise an empty text."""
     name, _, number = outcome.name.rpartition("~")
     renamed = outcome.status == "added" and outcome.name != outcome.path.stem
     return name if renamed and number.isdecimal() else ""
 
 
 def _say_scope(reports: Iterable[Mapping[str, Any]], out: PrintedRows) -> None:
-    """Print the data that the settings of traces excluded. Rows of machine formats have it as ``scope``."""
+    """Print the data that the settings of traces excluded. JSON rows already contain them as ``scope``."""
     from sgstore.model.scope import scope_of
 
     if out.chosen not in {Format.json, Format.ndjson}:
@@ -172,7 +172,7 @@ def _with_more(
     names: tuple[str, ...],
     out: PrintedRows,
 ) -> tuple[tuple[str, ...], Iterable[tuple[Any, ...]]]:
-    """Return result rows; machine formats get columns for parts of the reports."""
+    """Return result rows. For JSON, add columns with some values of each recording's report."""
     if out.chosen not in {Format.json, Format.ndjson}:
         return columns, rows
     parts = (tuple(map(one.get, names)) for one in reports)
@@ -182,7 +182,7 @@ def _with_more(
 def _land(
     store: Path, paths: list[Path], shard: str | None, options: dict[str, Any], *, alone: bool
 ) -> list[TraceOutcome]:
-    """Ingest a share of recordings as segment files into a collection, and return the results.
+    """Ingest recordings, or one share of them, into a collection. Return the result of each recording.
 
     ``alone`` is true if an option for single stores was given, which is an error.
     """
@@ -216,7 +216,7 @@ def _say_warnings(outcome: TraceOutcome) -> None:
 
 
 def _no_kind(type_name: str) -> str:
-    """Return advice for a type name in a recording that is not mapped to a kind of entity."""
+    """Return advice for an unknown type name in a recording: how to map it to a kind of entity."""
     name = json.dumps(type_name, ensure_ascii=False)
     return (
         "of which nothing says what kind it is; to say it, write into a file for --config:"
@@ -324,7 +324,7 @@ def _list_collection(url: str, names: list[str], out: PrintedRows) -> None:
 
 
 def _describe_traces(file: StoreFile, names: list[str], out: PrintedRows) -> None:
-    """Print all data about traces: a document for one trace, rows for several."""
+    """Print all data about traces: one document for a single trace, a row per trace for several."""
     with file.snapshot():
         found = [file.trace(name) for name in names]
         channels = [[asdict(one) for one in file.channels(trace.trace_id)] for trace in found]

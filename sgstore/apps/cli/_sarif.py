@@ -87,7 +87,7 @@ def write_sarif(
 
 
 def _address() -> str:
-    """Return the web address of the project: ``Source`` in its metadata, otherwise its package page."""
+    """Return the web address of the project's source code, or else of its package page."""
     from importlib.metadata import metadata
 
     links = metadata("sgstore").get_all("Project-URL") or []

@@ -384,7 +384,7 @@ def docs(page: Annotated[str, Argument()] = "") -> int:
 
 
 def _pages() -> dict[str, Path]:
-    """Return the pages of the documentation by name: of a checkout, or installed by the wheel."""
+    """Return the pages of the documentation by name, from a source checkout or from the installed package."""
     from importlib.metadata import files
 
     folder = Path(__file__).parents[3] / "docs"

@@ -144,7 +144,7 @@ def check_lock_name(to: Path | None) -> None:
 
 
 def say_chosen(chosen: ChosenFrames, out: PrintedRows, *, world: bool) -> None:
-    """Print the traces that cannot answer the query of some frames, and the data that settings excluded."""
+    """Print the traces that cannot answer a query, and the data that settings excluded from the store."""
     say_left_out(chosen)
     say_scope(chosen.scope(world=world), out.chosen)
 

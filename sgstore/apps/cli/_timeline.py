@@ -97,7 +97,7 @@ def timeline(
 def _asked(
     queries: list[str], files: list[Path], names: list[str], values: Mapping[str, Any]
 ) -> dict[str, tuple[str, Mapping[str, object]]]:
-    """Return the queries to plot by lane name, each with the values of its parameters."""
+    """Return the queries to plot, and the values of their parameters, by lane name."""
     from sgstore.apps.verbs import by_lane, free_name
     from sgstore.lang.library import pattern_named
 

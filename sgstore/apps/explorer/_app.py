@@ -74,7 +74,7 @@ async def _lines(replies: Replies) -> AsyncGenerator[bytes]:
 
 
 async def _last(replies: Replies) -> AsyncGenerator[bytes]:
-    """Yield only the last reply of a query, as JSON: the complete result."""
+    """Read all replies of a query, and yield the last one as JSON. It contains the complete result."""
     *_, last = [reply async for reply in replies]
     yield as_json(last)
 
@@ -145,7 +145,7 @@ class _Answer(StreamingResponse):
 
 
 class Explorer:
-    """State that all endpoints of the web page share: stores, sandboxes, tags and running queries.
+    """Objects that all endpoints of the web page share: stores, sandboxes, tags and running queries.
 
     Parameters
     ----------
@@ -190,7 +190,7 @@ class Explorer:
             self._threads.submit(reads.warm, self._ended)
 
     def stop(self) -> None:
-        """Cancel all running queries. Their responses end with an error."""
+        """Cancel all running queries. The HTTP responses of these queries end with an error."""
         for answer in tuple(self.busy):
             answer.end()
 
@@ -218,7 +218,7 @@ class Explorer:
         )
 
     def _tables(self) -> dict[str, Path]:
-        """Return the files with the tags of users, by table name, for queries. Empty without tags."""
+        """Return the table file with the tags of users, by table name, for queries; empty without tags."""
         found = self.notes.read()
         if not found:
             return {}
@@ -227,7 +227,7 @@ class Explorer:
         return {"notes": table}
 
     def pool(self, side: str, text: str) -> SandboxPool:
-        """Return the sandbox processes for a query on a store. Queries about tags get the current tags."""
+        """Return the sandbox processes for a query on a store. If tags have changed, start new processes."""
         if side == "a" and "notes" in text.lower() and self._stamp != self.notes.stamp():
             self._stamp = self.notes.stamp()
             old, self._pools["a"] = self._pools["a"], self._pool("a")
@@ -274,7 +274,7 @@ class Explorer:
         return JSONResponse({"cancelled": done})
 
     async def one(self, request: Request, ask: str) -> Response:
-        """Endpoint for a query with one complete result, such as the verdicts of checks."""
+        """Endpoint for a query whose complete result is sent at once, such as the verdicts of checks."""
         fields = await fields_of(request)
         side = self._side(fields)
         question = {"ask": ask, **taken(fields, *_QUESTIONS[ask])}
@@ -306,17 +306,17 @@ class Explorer:
         return answered(await self.threaded(ask))
 
     async def about(self, _: Request) -> Response:
-        """Endpoint with the traces of each store. It also states if the page may write files."""
+        """Endpoint that returns the traces of each store, and whether the page may write files."""
         sides = {side: await self.threaded(reads.about) for side, reads in self.reads.items()}
         writing = self.write_to is not None
         return JSONResponse({**sides["a"], "other": sides.get("b"), "writing": writing})
 
     async def stamps(self, _: Request) -> Response:
-        """Endpoint with a short text for each store. The text changes whenever the store changes."""
+        """Endpoint that returns a short text for each store. The text changes whenever the store changes."""
         return JSONResponse({side: one.file.stamp for side, one in self.stores.items()})
 
     async def tags(self, request: Request) -> Response:
-        """Endpoint with all tags of users; POST adds or removes a tag."""
+        """Endpoint that returns all tags of users; POST adds or removes a tag."""
         fields = await fields_of(request)
         if request.method == "POST":
             told = taken(fields, "trace", "seq", "tag", "note", "do")
@@ -333,7 +333,7 @@ class Explorer:
         return JSONResponse({"notes": notes, "file": self.notes.path.name})
 
     async def last_selection(self, request: Request) -> Response:
-        """Endpoint with the last selection of the store: ticked matches as text. POST replaces it."""
+        """Endpoint that returns the last selection of matches in the store as text; POST replaces it."""
         if request.method == "POST":
             ticks = taken(await fields_of(request), "ticks")["ticks"]
             await self.threaded(write_bytes, self.selection, ticks.encode())
@@ -378,7 +378,7 @@ class Explorer:
 
 
 async def page_of(request: Request, script: str = "main.js") -> Response:
-    """Return the HTML page with its first script and the nonce of the content security policy."""
+    """Return the HTML page. Insert its first script, and the nonce of the content security policy."""
     text = (PAGE / "index.html").read_text(encoding="utf-8").replace(_SCRIPT, f"js/{script}")
     nonce = request.scope["state"]["nonce"]
     return Response(text.replace(_NONCE, nonce), media_type="text/html")
@@ -412,7 +412,7 @@ def answered(found: Any) -> Response:
 
 
 def application(explorer: Explorer, token: str, hosts: tuple[str, ...], cookie: str) -> Guard:
-    """Return the ASGI application of the explorer. Its requests need a token.
+    """Return the ASGI application of the explorer. Each request must have a token.
 
     Parameters
     ----------
@@ -447,7 +447,7 @@ def application(explorer: Explorer, token: str, hosts: tuple[str, ...], cookie: 
 
 
 class _PageFiles(StaticFiles):
-    """Static files of the page. Browsers must ask for a newer version each time."""
+    """Static files of the page. Browsers must check for a new version of a file before each use."""
 
     def file_response(self, *args: Any, **kwargs: Any) -> Response:
         response = super().file_response(*args, **kwargs)

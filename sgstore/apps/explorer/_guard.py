@@ -88,7 +88,7 @@ class Guard:
         await (answer or self._app)(scope, receive, send_with_headers)
 
     def _refusal(self, scope: Scope) -> Response | None:
-        """Return a response that rejects the request or sets the login cookie; or None for a valid request.
+        """Return a response that rejects the request or sets the login cookie.
 
         ``None`` means that the request may pass.
         """
@@ -123,7 +123,7 @@ class Guard:
 
 
 def host_of(name: str, port: int | None) -> str:
-    """Return a host name or address with a port, in the form of the HTTP header ``Host``."""
+    """Return a host and a port in the form of the HTTP header ``Host``; IPv6 addresses are in brackets."""
     return f"[{name}]:{port}" if ":" in name else f"{name}:{port}"
 
 

@@ -1,4 +1,4 @@
-"""Web page of a running monitor: current frames, states of checks and patterns, and truth lanes of matches.
+"""Web page of a running monitor: current frames, and the verdicts and matches over time.
 
 The monitor passes each frame to a :class:`LiveRun`. It keeps the last frames as sent messages, and
 the graphs of the last few seconds, so that the page can show the parts of a match around its time.
@@ -160,7 +160,7 @@ class LiveRun:
         return found
 
     def _new_still(self, things: Things) -> list[list[Any]]:
-        """Return the static entities that were not sent yet: node, kind, x, y, heading, length, width."""
+        """Return the static entities that were not sent yet, each with position, heading and size."""
         x, y = self._origin or (0.0, 0.0)
         new = [n for n, about in things.items() if about["is_static"] and n not in self._still]
         for node in new:
@@ -172,7 +172,7 @@ class LiveRun:
         return [self._still[node] for node in new]
 
     def about(self) -> dict[str, Any]:
-        """Return the description of the run for the page, in the same form as a store with one trace."""
+        """Return a description of the run for the page, as if the run was a store with one trace."""
         key, cameras = "live" * self._has_map, [] if self._cameras is None else self._cameras.topics
         trace = {"name": self.name, "frames": 0, "seconds": 0.0, "period": 0.0, "map": ""}
         trace |= {"map_key": key, "origin": self._origin or (0.0, 0.0), "cameras": [*cameras]}
@@ -185,11 +185,11 @@ class LiveRun:
         return {**told, "writing": False, "checks": checks, "patterns": patterns}
 
     def map(self) -> bytes:
-        """Return the outlines of the road map as bytes; empty without a map."""
+        """Return the outlines of the road map as bytes; empty if the run has no map."""
         return self._map
 
     def parts(self, text: str, binding: Mapping[str, int] | None) -> dict[str, Any]:
-        """Return, for each part of a pattern, the recent frames in which it is true for one match.
+        """For one match, return for each part of the pattern the recent frames in which that part is true.
 
         Raises
         ------
@@ -215,7 +215,7 @@ class LiveRun:
         return packed({"trace": self.name, "attribute": attribute}, columns)
 
     def picture(self, seq: int, channel: str) -> tuple[bytes, str]:
-        """Return the camera picture of a frame, with its media type; empty without a picture.
+        """Return the camera picture of a frame, with its media type; empty if no picture is recorded.
 
         Raises
         ------
@@ -261,13 +261,13 @@ class LiveRun:
             return self._recent.view(seq)
 
     def _hello(self) -> tuple[int, bytes]:
-        """Return the number of the oldest stored message, and the first message for a new page."""
+        """Return the number of the oldest stored message, and the first message that a new page receives."""
         with self._lock:
             told = {"about": self.about(), "names": self._names, "still": [*self._still.values()]}
             return self._gone, b"event: hello\ndata: " + as_json(told) + b"\n\n"
 
     def _since(self, number: int) -> tuple[int, list[bytes]]:
-        """Return the stored messages from a number on, and the number of the next message."""
+        """Return the stored messages with this number or a later one, and the number of the next message."""
         with self._lock:
             found = list(islice(self._sent, max(number - self._gone, 0), None))
             return self._gone + len(self._sent), found
@@ -284,7 +284,7 @@ class LiveRun:
 
 
 def live_application(run: LiveRun, token: str, hosts: tuple[str, ...], cookie: str) -> Guard:
-    """Return the ASGI application with the page of a monitor. Its requests need a token."""
+    """Return the ASGI application with the page of a monitor. Each request must have a token."""
 
     async def ask(request: Request, name: str, fields: Sequence[str]) -> Response:
         told = taken(await fields_of(request), *fields)
@@ -317,7 +317,7 @@ def _columns(things: Things, ego: int | None, origin: tuple[float, float]) -> di
 
 
 def _origin_of(graph: SceneGraph) -> tuple[float, float]:
-    """Return a point near the entities, to which the coordinates of the page are relative."""
+    """Return the origin of the page's coordinates: a point near the entities, in whole metres."""
     places = [a for n, a in graph.nodes.items() if n >= 0]
     first = graph.nodes[graph.ego] if graph.ego is not None else next(iter(places), {})
     return float(round(first.get("x", 0.0))), float(round(first.get("y", 0.0)))

@@ -1,4 +1,4 @@
-"""Long tasks of the explorer page: coverage, export or lock of selected clips, comparison of two stores.
+"""Long tasks of the explorer page: coverage, comparison of two stores, export or lock of selected clips.
 
 Each function implements the task of its name, with the fields as parameters.
 """
@@ -76,7 +76,7 @@ def coverage(store: Store, what: str, abstraction: str) -> dict[str, Any]:
 
 
 def select(store: Store, clips: Clips, abstraction: str) -> dict[str, Any]:
-    """Return the length of the selected clips, and the share of the scene classes of the store in them.
+    """Return the length of the selected clips, and the share of the store's scene classes that they cover.
 
     Returns
     -------
@@ -139,7 +139,7 @@ def _done(done: int, whole: int) -> None:
 
 
 def _frames(store: Store, clips: Clips) -> Iterator[tuple[tuple[str, int, int], Any, float]]:
-    """Yield the clips without overlaps, with the ids of their frames and their length; s."""
+    """Merge overlapping clips. Yield each clip with the ids of its frames and its length; s."""
     traces = {one.name: one for one in store.traces()}
     for trace, first, last in _apart(clips):
         of = traces.get(trace) or store.file.trace(
@@ -163,7 +163,7 @@ def _apart(clips: Clips) -> list[tuple[str, int, int]]:
 
 
 def _table(of: ReportTable) -> dict[str, Any]:
-    """Return a result table as JSON values for the page, with the total number of rows."""
+    """Convert a result table to JSON values for the page, in plain words. Long tables are cut."""
     of_words = [_WORDS.get(name) for name in of.columns]
     rows = [
         [

@@ -52,7 +52,7 @@ class RequestError(SgstoreError):
 
 
 async def fields_of(request: Request) -> dict[str, Any]:
-    """Return the fields of a request, from its JSON body or, for GET, from its address.
+    """Return the fields of a request: from the address for GET, otherwise from the JSON body.
 
     Raises
     ------
@@ -78,12 +78,12 @@ async def fields_of(request: Request) -> dict[str, Any]:
 
 
 def taken(fields: Mapping[str, Any], *names: str) -> dict[str, Any]:
-    """Return the named fields of a request after validation (:data:`FIELDS`), with default values."""
+    """Validate the named fields of a request; missing fields get default values. Return the fields."""
     return {name: FIELDS[name](fields.get(name, USUAL.get(name)), name) for name in names}
 
 
 def one_of(*words: str) -> Callable[[object, str], str]:
-    """Return a validator for a request field with a fixed list of words. The first word is the default."""
+    """Return a validator for a request field that accepts only the given words. The first is the default."""
 
     def read(value: object, name: str) -> str:
         if value not in (None, *words):
@@ -104,7 +104,7 @@ def _text(value: object, name: str) -> str:
 
 
 def _ticks(value: object, name: str) -> str:
-    """Validate a selection: ticked matches as text, in the form of the page's address."""
+    """Validate a selection of matches: a text in the form that the address of the page contains."""
     if not isinstance(value, str) or not _TICKS.fullmatch(value):
         raise RequestError(f"{name}: expected ticked matches as in the address of the page")
     return value
@@ -123,7 +123,7 @@ def _parameters(value: Any, _: str) -> dict[str, Any]:
 
 
 def _binding(value: Any, _: str) -> dict[str, int] | None:
-    """Validate a binding (variable name → node id). ``None`` means that the field is missing."""
+    """Validate a binding (variable name → node id). If the field is missing, return ``None``."""
     if value is None:
         return None
     if not isinstance(value, dict) or len(value) > 1000:
@@ -142,7 +142,7 @@ def _spans(rows: object, name: str, width: int) -> list[tuple[Any, ...]]:
 
 
 def _clips(value: object, name: str) -> list[tuple[Any, ...]]:
-    """Validate rows of clips: the name of a trace, and the first and last frame of each of its clips."""
+    """Validate lists of clips, one per trace: the trace name, then the first and last frame of each clip."""
     rows: list[Any] = value if isinstance(value, list) else [None]
     if any(
         not isinstance(row, list) or len(row) % 2 == 0 or not isinstance(row[0], str)

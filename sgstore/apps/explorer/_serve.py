@@ -145,7 +145,7 @@ def _begun(
     told: Iterable[Callable[[str], object]],
     link: str = "",
 ) -> Generator[tuple[uvicorn.Server, socket.socket]]:
-    """Yield a web server that is not started yet, with its socket, and report its address to the user."""
+    """Yield a web server before its start, and its socket. Report its address to the user."""
     with _listening(host, port) as listening:
         number = listening.getsockname()[1]
         token = secrets.token_urlsafe(24)

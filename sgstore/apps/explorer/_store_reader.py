@@ -91,7 +91,7 @@ class Reads:
         return {**about, "traces": listed, "codes": StateColumns(file).codes()}
 
     def about(self) -> dict[str, Any]:
-        """Return the traces of the store, and the kind and light names of the codes in binary columns."""
+        """Return a description of the store: its traces, and the names of kinds and lights by their code."""
         return self._traces()[1]
 
     def frame_id(self, trace: str, seq: int) -> int:
@@ -136,7 +136,7 @@ class Reads:
         return packed({"trace": trace, "names": names}, found)
 
     def map(self, trace: str) -> bytes:
-        """Return the outlines of the road map of a trace as bytes; empty without a map."""
+        """Return the outlines of the road map of a trace as bytes; empty if the trace has no map."""
         key = _among(StateColumns(self._store.file).places(), trace)[2]
         with self._reading:  # one map at a time, so that it is not read twice
             if key not in self._maps:
@@ -145,7 +145,7 @@ class Reads:
             return self._maps[key]
 
     def warm(self, ended: threading.Event) -> None:
-        """Read all road maps of the store, so that the first request is fast. ``ended`` stops the reading."""
+        """Read all road maps of the store in advance, until the event ``ended`` is set."""
         with suppress(SgstoreError):
             for trace in self._traces()[0]:
                 if ended.is_set():
@@ -186,19 +186,19 @@ class Reads:
         ]
 
     def search(self, text: str) -> list[str]:
-        """Return the names of the library patterns that match some words, best match first."""
+        """Return the names of the library patterns that match a text, best match first."""
         return [one.name for one in search(text)]
 
 
 def _among(traces: Mapping[str, T], name: str) -> T:
-    """Return the entry of a trace in a mapping. An unknown trace raises an error."""
+    """Return the entry of a trace in a mapping. Raise an error for an unknown trace."""
     if name not in traces:
         raise StoreError(f"no trace {name!r} in the store")
     return traces[name]
 
 
 def shown_picture(media: Media | None, channel: str) -> tuple[bytes, str]:
-    """Return a picture in a format that browsers can show, and its media type. Empty without a picture."""
+    """Return a picture that browsers can show, and its media type; empty if no picture is recorded."""
     if media is None:
         return b"", "application/octet-stream"
     if media.form not in _PICTURES:
@@ -207,7 +207,7 @@ def shown_picture(media: Media | None, channel: str) -> tuple[bytes, str]:
 
 
 def drawn_map(road_map: RoadMap | None) -> bytes:
-    """Return the outlines of a road map as bytes; empty without a map."""
+    """Return the outlines of a road map as bytes; empty if the map is missing."""
     if road_map is None:
         return packed({"origin": [0, 0], "words": []}, {})
     drawn = DrawnOutlines.of(road_map)

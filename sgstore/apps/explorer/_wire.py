@@ -1,4 +1,4 @@
-"""Binary format of columns, which the page reads without copying, and JSON text for browsers.
+"""Binary format of columns, which the web page reads without copying; JSON text that browsers accept.
 
 ``u32 length of the header, u32 0``, the header as JSON padded to 8 bytes, then each column, little-endian,
 padded to 8 bytes. The header names the columns with their types and lengths under ``columns``.

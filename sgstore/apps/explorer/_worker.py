@@ -29,7 +29,7 @@ BATCH_ROWS: Final = 500
 
 
 def _told_matches(store: Store, question: dict[str, Any], most: int) -> Iterator[Reply]:
-    """Yield the replies to a pattern query: columns and traces that cannot answer, then batches of matches.
+    """Yield the replies to a pattern query: column names and traces without an answer, then the matches.
 
     If rows are values of several matches, there is one reply with the rows instead.
     """
@@ -82,14 +82,14 @@ def _told_parts(store: Store, question: dict[str, Any], _: int) -> Iterator[Repl
 
 
 def _told_values(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
-    """Yield the values in the conditions of a pattern in a frame: by lane and condition."""
+    """Yield the values that the conditions of a pattern compare in a frame, by lane and condition."""
     text, frame, binding = question["text"], question["frame"], question["binding"] or {}
     found = store.condition_values(text, frame, binding, **question["parameters"])
     yield {"values": [[[*map(asdict, of)] for of in lane] for lane in found]}
 
 
 def _told_why(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
-    """Yield the first part of a pattern that fails in a frame, and numbers with which it would be true."""
+    """Yield the first part of a pattern that fails in a frame, and changed numbers that make this part true."""
     text, values, frame = question["text"], question["parameters"], question["frame"]
     answer = store.why_not(frame, text, **values)
     steps = answer.steps if isinstance(answer, WhyNotSteps) else (answer,)
