@@ -10,8 +10,8 @@ import library_page
 import numpy as np
 import pytest
 from formulas import formula_of
-from library_scenes import SCENES, is_of_the_ego, traces
-from scenes import APART, store_of
+from library_scenes import LEFT, RIGHT, SCENES, WAYS, aside, is_of_the_ego, traces
+from scenes import APART, Scene, actor, along, ego, store_of, street
 from test_sample import told
 from test_temporal import FORMULAS, FORMULAS_OF_TIME, never, property_named
 from thorough import LONG, some
@@ -325,3 +325,36 @@ def broken_in(verdict: Verdict) -> set[int]:
     return {
         of[node] for witness in verdict.witnesses for node in witness.nodes.values() if node >= 0
     }
+
+
+# Scenes that are nearly a manoeuvre -------------------------------------------------------------------------
+
+COMES_OVER = Scene(WAYS, ego(aside(40, LEFT, RIGHT), 15), actor("v", along(RIGHT), 15, start=12))
+"""The ego changes into the lane of a vehicle ahead."""
+DRIVES_ON = Scene(
+    street("driving", "driving", cut=60.0),
+    ego(along(RIGHT), 12),
+    actor("v", along(RIGHT), [(0, 14), (3, 14), (6, 8)], start=30),
+    seconds=8,
+)
+"""Two vehicles in one lane, which is two parts of the map."""
+
+
+@pytest.mark.parametrize("name", ["cut_in", "CutIn", "iso_cut_in", "iso_change_cut_in"])
+@pytest.mark.parametrize("scene", [COMES_OVER, DRIVES_ON], ids=["comes over", "drives on"])
+def test_no_vehicle_cuts_in_if_only_the_ego_changes_lanes(
+    scene: Scene, name: str, tmp_path: Path
+) -> None:
+    store = store_of(tmp_path / "s.sgstore", {"scene": [scene]})
+
+    assert store.find(patterns()[name].text).count() == 0
+
+
+def test_a_contact_does_not_restore_the_following_distance(tmp_path: Path) -> None:
+    """The ego runs through a slower vehicle, which is then no longer its lead."""
+    scene = Scene(WAYS, ego(along(RIGHT), 12), actor("v", along(RIGHT), 6, start=40), seconds=12)
+    store = store_of(tmp_path / "s.sgstore", {"scene": [scene]})
+
+    (found,) = store.check(patterns()["r157_following"].text)
+
+    assert found.verdict == "false"

@@ -191,20 +191,29 @@ def street(
     left: tuple[str, ...] = (),
     zebra: float | None = None,
     limit: float | None = None,
+    cut: float | None = None,
 ) -> RoadMap:
     """A straight road from x = -100 to 400; types of its lanes from the middle outwards.
 
     Lanes to the right lead along x, those to the left against it. One may change between lanes of a side.
-    ``limit``: of speed; m/s.
+    ``limit``: of speed; m/s. ``cut``: x at which each lane goes on as another part of the map.
     """
     limits = () if limit is None else (element("speed", sOffset=0, max=limit, unit="m/s"),)
-    lanes = [lane(0, mark("broken"))]
-    for side, sign in ((right, -1), (left, 1)):
-        for number, kind in enumerate(side, start=1):
-            records = (width(WIDTHS.get(kind, LANE)), mark("broken", laneChange="both"), *limits)
-            lanes.append(lane(sign * number, *records, kind=kind))
+
+    def lanes(link: str = "") -> list[str]:
+        found = [lane(0, mark("broken"))]
+        for side, sign in ((right, -1), (left, 1)):
+            for number, kind in enumerate(side, start=1):
+                records = (width(WIDTHS.get(kind, LANE)), mark("broken", laneChange="both"))
+                links: dict[str, Any] = {link: sign * number} if link else {}
+                found.append(lane(sign * number, *records, *limits, kind=kind, **links))
+        return found
+
     objects = crosswalk("zebra", zebra + 100, 0.0, 20.0) if zebra is not None else ""
-    road = a_road("1", line(500.0, x=-100.0), sections=section(*lanes), objects=objects)
+    sections = section(*lanes())
+    if cut is not None:
+        sections = section(*lanes("after")) + section(*lanes("before"), s=cut + 100)
+    road = a_road("1", line(500.0, x=-100.0), sections=sections, objects=objects)
     return read_map(a_map(road), "street")
 
 
