@@ -267,7 +267,8 @@ function paintEntity(ctx, c, i, scale, ink, what, turn, aside, arrows) {
   ctx.restore();
   if (width * scale > 7 && length > width && !glyph && !SCENERY.has(kind)) {
     const cos = Math.cos(heading), sin = Math.sin(heading);
-    [[0.42 * length, 0], [0.18 * length, 0.32 * width], [0.18 * length, -0.32 * width]].forEach(([ahead = 0, left = 0], k) => {
+    const corners = [[0.42 * length, 0], [0.18 * length, 0.32 * width], [0.18 * length, -0.32 * width]];
+    corners.forEach(([ahead = 0, left = 0], k) => {
       const x = c.x[i] + ahead * cos - left * sin, y = c.y[i] + ahead * sin + left * cos;
       if (k) arrows.lineTo(x, y); else arrows.moveTo(x, y);
     });
