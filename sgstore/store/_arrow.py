@@ -146,7 +146,7 @@ def record_batches(
 
 
 def as_told_batches(columns: Sequence[str], stream: ArrowStream) -> ArrowStream:
-    """Rename the columns of Arrow batches, and convert numbers to int64 and float64, like Python."""
+    """Rename the columns of Arrow batches, and convert 32-bit numbers to 64 bits."""
     (named, batches), first, rows = stream, list[Any](), 0
     for batch in batches:
         first.append(batch)

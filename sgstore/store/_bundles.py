@@ -1,4 +1,4 @@
-"""Bundles: store files of a collection, with sorted and renamed traces of one or several stores.
+"""Bundles: store files of a collection. A bundle has sorted traces of one or several stores.
 
 Ids of traces, maps, recordings and settings come from digests. They are equal in every store, so rows are
 copied unchanged.
@@ -135,7 +135,7 @@ class BundleSource:
 
 
 def _memory() -> int:
-    """Return the memory of the database for a bundle, so that the process stays below the default memory."""
+    """Return the memory limit of the database while a bundle is made; bytes."""
     return default_memory() * 5 // 8
 
 
@@ -200,7 +200,7 @@ def _copied(
 def _choose(
     connection: DuckDBPyConnection, traces: Mapping[int, str], maps: Mapping[str, str]
 ) -> None:
-    """Create temporary SQL tables of the selected traces and of the new names of road maps."""
+    """Create temporary SQL tables with the selected traces, and with the new names of road maps."""
     for table, kind, values in (("chosen", "BIGINT", traces), ("named", "VARCHAR", maps)):
         connection.execute(
             f"CREATE OR REPLACE TEMP TABLE {table} AS SELECT unnest(CAST($1 AS {kind}[])) AS key,"
@@ -375,7 +375,7 @@ def _words(bundle: str, catalog: Any) -> Iterator[tuple[Any, ...]]:
 
 
 def split_segment(sealed: Path, to: Path, of_map: Path) -> str:
-    """Split an unpublished trace into trace and road map files. Return the map digest; empty without a map.
+    """Copy an unpublished trace to a folder, and its map to another. Return the map digest; empty if none.
 
     Parameters
     ----------
@@ -426,7 +426,7 @@ def _copy_topics(source: Path, to: Path) -> None:
 def _copy_pieces(
     sources: Sequence[Path], place: Callable[[str], Path], folders: Sequence[Path]
 ) -> None:
-    """Copy the tables of segments to new files, each table to the file at its place."""
+    """Copy the tables of segments to new folders. ``place`` returns the folder for a table name."""
     with ExitStack() as stack:
         fresh = {
             to: stack.enter_context(closing(TableFile(to / FILE, to, new=True))) for to in folders

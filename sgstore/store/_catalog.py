@@ -1,4 +1,4 @@
-"""Catalog of a store (names, types and row counts) for the query compiler, one per abstraction.
+"""Catalogs of a store for the query compiler: names, types and row counts. Each abstraction has one.
 
 With an abstraction, a query sees other tables under the same names: *shadows*, defined before its statement.
 """
@@ -100,12 +100,12 @@ def catalog_of(connection: DuckDBPyConnection) -> Catalog:
 
 
 def subset_catalogs() -> dict[str, Callable[[Catalog], Catalog]]:
-    """Return one function per abstraction that drops nodes or edges. It converts the catalog of the store."""
+    """Return a function for each abstraction that drops nodes or edges. It adapts the store's catalog."""
     return {name: partial(_narrowed, name=name, of=of) for name, of in SUBSETS.items()}
 
 
 def _sets(connection: DuckDBPyConnection) -> tuple[DerivedSet, ...]:
-    """Return the derived sets of relations in a store. Most stores have none, so the slow import is avoided."""
+    """Return the derived sets of relations in a store. Without such sets, it avoids a slow import."""
     if connection.execute("SELECT 1 FROM derived LIMIT 1").fetchone() is None:
         return ()
     from sgstore.store._derive import sets_of
@@ -133,7 +133,7 @@ _KNOWN: Final = ("state", "node", "lane_state", "lane_gap")
 
 
 def _beyond(connection: DuckDBPyConnection) -> dict[str, Any]:
-    """Return the catalog fields for objects outside the graphs. A store without such objects gives {}."""
+    """Return the catalog fields for objects outside the graphs; an empty dict without such objects."""
     tables = ("world_state", "world_node", "world_edge")
     there = " UNION ALL ".join(f"(SELECT 1 FROM {table} LIMIT 1)" for table in tables)
     if connection.execute(there).fetchone() is None:
@@ -167,7 +167,7 @@ def _own(connection: DuckDBPyConnection, whose: str) -> dict[str, Type]:
 
 
 def _type_of(traces: list[tuple[Type, bool, bool]]) -> Type:
-    """Return the common type of a user-defined attribute from its type in each trace.
+    """Return the common type of a user-defined attribute. Its type can differ from trace to trace.
 
     Each trace adds its type and two flags: whole values, large values.
     """
@@ -191,7 +191,7 @@ _HOLDERS: Final = {
 def _lacking(
     connection: DuckDBPyConnection, held: Mapping[Home, frozenset[str]]
 ) -> dict[str, frozenset[str]]:
-    """Return the kinds of nodes that have no value of an attribute in some frame: attribute → kinds.
+    """For each attribute, return the kinds of nodes that lack a value in some frame: attribute → kinds.
 
     DuckDB skips row groups without missing values. ``held``: kinds in tables that may not have the column.
     """
@@ -265,7 +265,7 @@ def _narrowed(whole: Catalog, name: str, of: Subset) -> Catalog:
 def _derived(
     connection: DuckDBPyConnection, whole: Catalog, name: str, of: list[DerivedSet]
 ) -> dict[str, Any]:
-    """Return the catalog fields that a derived set of relations changes, for the traces with this set."""
+    """For the traces with a derived set of relations, return the catalog fields that the set changes."""
     answers = {one.trace_id: frozenset(one.answers) for one in of}
     reaches = {one.trace_id: RelationScope.of(one.settings) for one in of}
     word = literal(name)
@@ -309,7 +309,7 @@ def _derived(
 
 
 def _beyond_derived(beyond: dict[str, str], shadows: dict[str, str], word: str) -> dict[str, str]:
-    """Return SQL tables of objects outside the graphs, with the edges of a derived set of relations."""
+    """Return SQL for objects outside the graphs, with the edges of a derived set: table name → SQL."""
     if not beyond:
         return {}
     traces = f"(SELECT d.trace_id FROM derived AS d WHERE d.name = {word})"
@@ -328,7 +328,7 @@ def _beyond_derived(beyond: dict[str, str], shadows: dict[str, str], word: str) 
 def _relations(
     connection: DuckDBPyConnection, whole: Catalog, of: list[DerivedSet]
 ) -> frozenset[str] | None:
-    """Return the relations that a derived set can contain. ``None`` means unknown.
+    """Return the relations that a derived set can contain; ``None`` if they are unknown.
 
     If a trace has a road map, the set lacks the relations that no trace answers: a relation needs only settings
     and a map. Without a map, the set lacks only the relations that the traces can answer in the store.

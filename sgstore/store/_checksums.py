@@ -67,7 +67,7 @@ class Checksum:
     value: int = 0
 
     def add(self, columns: Mapping[str, NDArray[Any] | None]) -> None:
-        """Update the checksum with rows, as columns of numbers and truth values with masked missing values.
+        """Add rows to the checksum, as columns of numbers and truth values. Missing values are masked.
 
         ``None`` means an all-missing column.
         """
@@ -77,7 +77,7 @@ class Checksum:
 
 
 def row_words(columns: Mapping[str, NDArray[Any] | None]) -> Words:
-    """Return a hash of each row, (N,), of columns as for :meth:`Checksum.add`."""
+    """Return a hash of each row, (N,). The columns are as for :meth:`Checksum.add`."""
     count = next((len(values) for values in columns.values() if values is not None), 0)
     hashes = np.zeros(count, np.uint64)
     words, shifted = (np.empty(min(count, _AT_ONCE), np.uint64) for _ in range(2))
@@ -117,7 +117,7 @@ def _mix(words: Words, spare: Words) -> None:
 
 
 def _words(values: NDArray[Any]) -> NDArray[np.uint32 | np.uint64]:
-    """Return the values of a column as words of up to 64 bits, for the checksum of rows."""
+    """Return the values of a column as words of 32 or 64 bits, for the checksum of rows."""
     if values.dtype.kind != "f":
         return values.astype(np.int64, copy=False).view(np.uint64)
     values = values + values.dtype.type(0)  # merges -0 and 0: DuckDB 1.5 drops the sign
@@ -125,7 +125,7 @@ def _words(values: NDArray[Any]) -> NDArray[np.uint32 | np.uint64]:
 
 
 def as_summed(table: str, columns: Columns, texts: Sequence[str]) -> dict[str, NDArray[Any] | None]:
-    """Convert table columns to numbers for :meth:`Checksum.add`. Absent columns are ``None``."""
+    """Convert table columns to numbers for :meth:`Checksum.add`. An absent column becomes ``None``."""
     enums = enums_of(table)
     found: dict[str, NDArray[Any] | None] = {}
     for name, kind in types_of(table).items():
@@ -154,7 +154,7 @@ def _number(kind: str, text: str) -> int:
 
 
 def _coded(enum: str, codes: NDArray[Any]) -> NDArray[Any]:
-    """Return enumeration codes that are the same in every store. Codes of user-defined names become hashes."""
+    """Convert enumeration codes to numbers that are equal in all stores. Values of users become hashes."""
     own = len(own_labels(enum))
     if codes.max(initial=0) < own:
         return codes
@@ -166,7 +166,7 @@ def _coded(enum: str, codes: NDArray[Any]) -> NDArray[Any]:
 def columns_of(
     connection: DuckDBPyConnection, table: str, catalog: str = ""
 ) -> list[tuple[str, str]]:
-    """Return names and types of a table's columns. ``duckdb_columns()`` is slower: it binds every view."""
+    """Return the name and the type of each column of a table. This is faster than ``duckdb_columns()``."""
     place = f"{quoted(catalog)}.{INSIDE}" if catalog else INSIDE
     rows = connection.execute(f"DESCRIBE {place}.{quoted(table)}").fetchall()
     return [(name, kind) for name, kind, *_ in rows]
@@ -200,7 +200,7 @@ def _text_number(value: str) -> str:
 
 
 def _list_number(value: str, table: str) -> str:
-    """Return SQL as :func:`_text_number` for lists of numbers. Lists equal to the first one are 7 times faster.
+    """Return SQL that converts a list of numbers to one number; 7 times faster for lists equal to the first.
 
     Many topics have lists that never change, such as covariances. Lists with -0 or NaN do not count, because
     equal lists can then have different texts.

@@ -77,11 +77,11 @@ class TraceClasses:
         self._known: OrderedDict[bytes, list[str]] = OrderedDict()
 
     def columns(self, seen: GraphColumns, trace_id: int, seq: Ints) -> Columns:
-        """Return the frame classes of a block of frames as columns of the table ``later_class``."""
+        """For a block of frames, return the scene classes as columns of the table ``later_class``."""
         return self._columns(self._named(seen), trace_id, seq)
 
     def ingested(self, seen: GraphColumns, trace_id: int, seq: Ints) -> Columns:
-        """Return the frame classes of a block of frames as columns of the table ``frame_class``.
+        """For a block of frames, return the scene classes as columns of the table ``frame_class``.
 
         Frames with equal content use the same cached classes.
         """
@@ -98,7 +98,7 @@ class TraceClasses:
         return self._columns([*zip(*of_frames, strict=True)], trace_id, seq)
 
     def _named(self, seen: GraphColumns) -> list[tuple[str, ...]]:
-        """Return the class names of some frames: one tuple per abstraction, with one name per frame."""
+        """For each abstraction, return the class names of some frames: a tuple with one name per frame."""
         # Crowded frames are processed one abstraction at a time, to limit memory.
         together = len(self._of) if len(seen.frame) < _FEW_EDGES else 1
         named: list[str] = []
@@ -251,7 +251,7 @@ class Abstracted:
         return {"frame_id": found["frame_id"], "class": np.asarray(found["class"], object)}
 
     def class_of(self, frame_id: int, name: str) -> str | None:
-        """Return the stored class of a frame in an abstraction. ``None`` means that no class is stored.
+        """Return the stored class of a frame in an abstraction; ``None`` if no class is stored.
 
         ``None`` means not stored, or abandoned as too symmetric.
         """
@@ -312,7 +312,7 @@ class Abstracted:
             return dict(connection.execute("SELECT graph, frame_id FROM imports").fetchall())
 
     def features(self, name: str, frame_id: Ints) -> Iterator[tuple[Ints, Triples]]:
-        """Yield the counts of node and edge labels in the graphs of given frames, in groups of frames.
+        """For given frames, yield the counts of node and edge labels in their graphs, in groups of frames.
 
         Parameters
         ----------
@@ -337,7 +337,7 @@ class Abstracted:
                 yield rows, triples(function(seen))
 
     def frames(self, name: str, first: int, last: int) -> tuple[Ints, GraphColumns, Labelled]:
-        """Return frame numbers, graphs and abstracted graphs of a range of frames of one trace.
+        """For a range of frames of one trace, return frame numbers, graphs and abstracted graphs.
 
         Raises
         ------
@@ -424,7 +424,7 @@ def coded_classes(connection: DuckDBPyConnection, name: str) -> CodedClasses:
 def classes_coded(
     connection: DuckDBPyConnection, kept: str, values: dict[str, Any] | None = None
 ) -> CodedClasses:
-    """Run SQL with columns ``class``, ``bucket``, ``mask``, and return the class of each frame as a number."""
+    """Run SQL that returns ``class``, ``bucket``, ``mask``. Return the class of each frame as a number."""
     names = connection.execute(_NAMES.format(kept), values).fetchnumpy()["name"]
     rows = connection.execute(_MASKS.format(kept), values).fetchnumpy()
     frame_id, row = frames_of(rows["bucket"].astype(np.int64), rows["mask"].astype(np.int64))
@@ -501,7 +501,7 @@ def _single(graphs: Labelled) -> tuple[Ints, Ints]:
 
 
 def _counted(of: tuple[Ints, Ints]) -> tuple[Ints, Ints, Ints]:
-    """Return the distinct pairs of numbers, and the count of each pair."""
+    """Return the distinct pairs (frame, label number), and how often each pair occurs."""
     frame, key = of
     span = int(key.max(initial=0)) + 1
     both, often = np.unique(frame * span + key, return_counts=True)

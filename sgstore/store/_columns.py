@@ -94,7 +94,7 @@ def blank(table: str, name: str, count: int) -> NDArray[Any]:
 
 
 def missing_of(table: str, name: str, values: NDArray[Any]) -> NDArray[np.bool_] | None:
-    """Return a mask of the missing values in a table column. ``None`` means that no value is missing."""
+    """Return a mask of the missing values in a table column; ``None`` if no value is missing."""
     if types_of(table)[name] in TEXTS:
         missing = values < 0
     elif values.dtype.kind == "f":
@@ -154,7 +154,7 @@ REPEATED: Final = {
 
 @cache
 def _keys(table: str) -> tuple[tuple[str, int, bool], ...]:
-    """Return the sort columns of a table: (name, right shift in bits, True if descending)."""
+    """Return how a table is sorted: for each sort column, its name, right shift (bits), and if it descends."""
     if table not in ORDERS:
         names = [name for name in types_of(table) if name != "mask" or table not in MASKS]
         return tuple((name, 0, False) for name in names)
@@ -233,7 +233,7 @@ def parted(columns: Columns) -> tuple[Columns, Columns]:
 
 
 def marked(columns: Columns) -> Columns:
-    """Add a column ``repeated`` (equal values in the next or previous frame), and sort by ego and by it."""
+    """Add a column ``repeated``: True if the next or previous frame has equal values. Sort the rows."""
     bucket = columns["frame_id"] >> FRAME_BITS
     values = {name: of for name, of in columns.items() if name != "frame_id"}
     same = _as_before({"bucket": bucket, **values})

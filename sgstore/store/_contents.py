@@ -44,7 +44,7 @@ TOGETHER: Final = 200_000
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """Digests of the settings and of the road map that produced the graphs of a trace.
+    """Digests of the settings and the road map from which the graphs of a trace were made.
 
     Attributes
     ----------

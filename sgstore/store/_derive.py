@@ -94,7 +94,7 @@ _HERE: Final = "bucket = $bucket AND mask & $bit <> 0"
 
 @dataclass(frozen=True, slots=True)
 class DerivedSet:
-    """Named set of relations (edges) of one trace, computed after ingest from the stored states of objects.
+    """Named set of relations (edges) of one trace. It was computed after ingest from stored object states.
 
     Attributes
     ----------
@@ -168,7 +168,7 @@ class Deriving:
         return tuple(one.trace for one in gone)
 
     def graph(self, whole: SceneGraph, name: str) -> SceneGraph:
-        """Return the scene graph of a frame with the nodes and edges of a derived set of relations.
+        """Return a frame's scene graph, with the nodes and edges of a derived set of relations.
 
         Parameters
         ----------
@@ -300,7 +300,7 @@ class Building:
         self._insert("derived_gap", packing.gap_columns(graph, self._trace_id))
 
     def append_labelled(self, seq: Ints, seen: GraphColumns, graphs: Labelled) -> None:
-        """Add the next abstracted frames to a derived set.
+        """Add the abstracted graphs of the next frames to a derived set of relations.
 
         Nodes and edges that a store cannot hold are dropped.
 
@@ -397,7 +397,7 @@ def _delete(connection: DuckDBPyConnection, name: str, trace_id: int) -> None:
 
 
 class _StateReader:
-    """Reader of the stored object states of one trace, as blocks of frames."""
+    """Reader of the object states of one trace. It returns them as blocks of frames."""
 
     def __init__(self, connection: DuckDBPyConnection, trace_id: int) -> None:
         self._connection = connection

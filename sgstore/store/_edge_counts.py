@@ -30,7 +30,7 @@ _PLAIN: Final = {
 
 
 def counted_edges(sql: str) -> tuple[str, str] | None:
-    """Return two statements that count edges from masks: one creates a table, the other is the query.
+    """Return two SQL statements: one creates a table of edge counts from bit masks, the other queries it.
 
     ``None`` means that the SQL statement is not a count of the rows of the view ``edges``, by columns that all
     frames of a mask share.
@@ -72,7 +72,7 @@ def _tree(connection: duckdb.DuckDBPyConnection, sql: str) -> dict[str, Any]:
 
 
 def _columns(node: dict[str, Any]) -> set[str] | None:
-    """Return the columns of ``edges`` that a statement uses. ``None`` if masks cannot answer the statement."""
+    """Return the columns of ``edges`` that a statement uses; ``None`` if bit masks cannot answer it."""
     table = node.get("from_table") or {}
     plain = (
         table.get("type") == "BASE_TABLE"
@@ -118,7 +118,7 @@ def _is_count(one: dict[str, Any]) -> bool:
 
 
 def _replace(node: dict[str, Any], count: dict[str, Any], table: dict[str, Any]) -> None:
-    """Replace the counts in a statement by sums, and the view ``edges`` by the table of these sums."""
+    """In a parsed statement, replace counts by sums, and the view ``edges`` by the table of edge counts."""
     for one in node["select_list"]:
         if _is_count(one):
             one["alias"] = one["alias"] or "count_star()"

@@ -63,7 +63,7 @@ FROM (
 
 
 class _MeasuredQuestion:
-    """Database connection whose SQL statement uses criticality measures of object pairs.
+    """Criticality measures of object pairs, for one database connection whose SQL statement uses them.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ class _MeasuredQuestion:
         self._reader.execute(f'USE "{at}".{INSIDE}')
 
     def value(self, measure: str, trace: int, src: int, dst: int) -> float | None:
-        """Return a criticality measure of an object pair in a trace. ``None`` means unknown or undefined."""
+        """Return a criticality measure of an object pair in a trace; ``None`` if unknown or undefined."""
         name = measure.removeprefix(KNOWN)
         if name not in RECORDED:
             raise ConfigError(f"no recorded measure: {measure!r}; expected {', '.join(RECORDED)}")
@@ -110,7 +110,7 @@ def _recorded(token: int, measure: Any, trace: Any, src: Any, dst: Any) -> float
 
 @contextmanager
 def recorded_measures(connection: DuckDBPyConnection, access: Access, sql: str) -> Generator[None]:
-    """Context manager that adds the SQL function ``recorded()`` to a connection, if a statement uses it.
+    """Context manager that adds the SQL function ``recorded()`` to a connection if a statement uses it.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def recorded_measures(connection: DuckDBPyConnection, access: Access, sql: str) 
 
 
 def show_recorded(connection: DuckDBPyConnection, sql: str) -> None:
-    """Add the function ``recorded()``, the view ``encounters`` and values of topics, if SQL uses them."""
+    """Add what the SQL uses: the function ``recorded()``, the view ``encounters``, the values of topics."""
     access = _places.get(id(connection))
     if access is None:
         return
@@ -177,6 +177,6 @@ def measured(
     src: int,
     dst: int,
 ) -> float | None:
-    """Return a criticality measure of an object pair in a trace. ``None`` means unknown."""
+    """Return a criticality measure of an object pair in a trace; ``None`` if it is unknown."""
     ((value,),) = ask("SELECT recorded(?, ?, ?, ?)", [f"{scope}{measure}", trace_id, src, dst])
     return value

@@ -117,7 +117,7 @@ def move(path: Path, to: Path, fault: str) -> Path:
 
 
 def os_fault(message: str, error: OSError) -> StoreError:
-    """Return a store error for an operating system error. A full disk has its own class and words."""
+    """Return a store error for an operating system error; :class:`DiskFullError` if the disk is full."""
     kind = DiskFullError if error.errno in FULL else StoreError
     return kind(f"{message}: {reason_of(error)}")
 

@@ -144,7 +144,7 @@ class StoreFile:
 
     @classmethod
     def together(cls, path: str | Path) -> StoreFile:
-        """Open a store in the database that all stores of its folder share. This is four times faster.
+        """Open a store in a database that all stores of its folder share. This is four times faster.
 
         Raises
         ------
@@ -175,7 +175,7 @@ class StoreFile:
 
     @staticmethod
     def replayed_topics(recording: Recording) -> AbstractContextManager[ReplayedTopics]:
-        """Context manager with the topics of an open recording that is replayed without a store."""
+        """Context manager that yields the topics of an open recording. No store is needed."""
         from sgstore.store._replayed_topics import replayed_topics
 
         return replayed_topics(recording)
@@ -186,7 +186,7 @@ class StoreFile:
 
     @contextmanager
     def shared(self) -> Generator[None]:
-        """Keep the store open as in :meth:`snapshot`, and the arrays of queries that several patterns need."""
+        """Keep the store open as in :meth:`snapshot`, and keep the query results that several patterns use."""
         with self.snapshot():
             self._answers = {}
             try:
@@ -290,7 +290,7 @@ class StoreFile:
     def user_sql(
         self, sql: str, timeout_s: float | None = None, given: UserTablesGiven | None = None
     ) -> UserSql:
-        """Return a read-only SQL statement of a user, with a time limit in s, and its temporary tables.
+        """Prepare a read-only SQL statement of a user, with a time limit in s and temporary tables.
 
         Examples
         --------
@@ -303,7 +303,7 @@ class StoreFile:
 
     @staticmethod
     def recording_sql(path: Path, sql: str, timeout_s: float | None = None) -> UserSql:
-        """Return a read-only SQL statement of a user on the topics of a recording, without a store."""
+        """Prepare a read-only SQL statement of a user on the topics of a recording, without a store."""
         from sgstore.store._topic_views import RecordingSql
         from sgstore.store._user_sql import UserSql
 
@@ -311,7 +311,7 @@ class StoreFile:
 
     @staticmethod
     def about_sql(sql: str) -> tuple[bool | None, tuple[str, ...]]:
-        """Return if an SQL statement reads views of the world alone, and notes on unknown kinds.
+        """Return which views an SQL statement reads (True: of the world, not of graphs), and notes on kinds.
 
         The first value is False for views of graphs, and ``None`` without such views.
         """
@@ -333,7 +333,7 @@ class StoreFile:
 
     @property
     def stamp(self) -> str:
-        """Return a short text that every write to the store changes."""
+        """Return a short text that changes at every write to the store."""
         return hashlib.sha256(repr(stamp_of(self.path)).encode()).hexdigest()[:16]
 
     def catalog(self) -> Catalog:
@@ -433,7 +433,7 @@ class StoreFile:
             return trace_named(connection, str(trace))[0]
 
     def meetings(self, measures: Sequence[str]) -> Iterator[Meetings]:
-        """Yield the encounters of the egos with other known objects, in windows, for the given measures."""
+        """For each ego, yield its encounters with all other known objects, with the given measures."""
         from sgstore.store._meetings import meetings
 
         with translated(self.path), self.access.reading() as connection:
@@ -455,7 +455,7 @@ class StoreFile:
         return next(iter(self.rows(sql, [self.trace_id(trace)]).values), None)
 
     def channels(self, trace: int | str) -> tuple[Channel, ...]:
-        """Return the channels of a trace's recording. Their ``messages`` is -1: unknown."""
+        """Return the channels of a trace's recording. Their message counts are -1 (unknown)."""
         sql = (
             "SELECT channel_id, coalesce(topic, ''), coalesce(schema, ''), coalesce(schema_encoding, ''),"
             " coalesce(message_encoding, ''), -1, role FROM channel WHERE trace_id = ? ORDER BY channel_id"
@@ -463,14 +463,14 @@ class StoreFile:
         return tuple(Channel(*row) for row in self.rows(sql, [self.trace_id(trace)]).values)
 
     def stored_topics(self) -> dict[int, dict[str, dict[str, Any]]]:
-        """Return the topics that are stored as columns: trace id → topic → messages, lost, fields."""
+        """Return the stored topics: trace id → topic → numbers of stored and lost messages, and fields."""
         from sgstore.store._topic_views import listed_topics
 
         with self.access.reading() as connection:
             return listed_topics(connection)
 
     def context(self, trace: int | str) -> MessageRefs:
-        """Return the file positions of recorded messages that are needed to read later messages of a trace.
+        """Return file positions of messages on which later messages of a trace depend, such as maps.
 
         ``channel`` is an index into :meth:`channels`.
         """
@@ -651,7 +651,7 @@ class StoreFile:
         return publish_each(self.access, sealed, replace=replace)
 
     def has(self, sealed: Sealed, *, as_it_is: bool = True) -> str | None:
-        """Return the store's name of a new trace that is already stored, or ``None`` if it is not stored.
+        """Find a new trace in the store. Return the trace's name in the store; ``None`` if it is not stored.
 
         Parameters
         ----------
@@ -669,7 +669,7 @@ class StoreFile:
             return found(connection, sealed.identity)
 
     def known_digest(self, path: Path) -> str:
-        """Return the digest of an ingested recording whose file looks unchanged, else an empty string."""
+        """Return the digest of an ingested recording if size and time of its file are unchanged; else empty."""
         from sgstore.mcap import mark_of
 
         try:
@@ -686,7 +686,7 @@ class StoreFile:
         return str(found[0]) if found and found[0] else ""
 
     def requested(self, path: Path, request: str) -> tuple[str, str, int, dict[str, Any]] | None:
-        """Return name, ego, frames and report of the stored trace that the same ingest request produced.
+        """Find the stored trace of the same ingest request. Return its name, ego, frames and report.
 
         ``None`` means no such trace, or a file that has changed.
         """
@@ -805,7 +805,7 @@ class StoreFile:
         *,
         public: bool = False,
     ) -> Generator[T]:
-        """Context manager that keeps the store open, and yields the result of a query.
+        """Context manager that runs a query, yields its result, and keeps the store open until the end.
 
         After an internal DuckDB fault, the query runs again. The exit stack of the query is closed at its end.
         """

@@ -55,7 +55,7 @@ class Deadline:
 
 
 def pass_gate(path: Path, deadline: Deadline) -> None:
-    """Wait while a writer process holds the lock file. This is a courtesy: the DuckDB lock decides."""
+    """Wait while a writer process holds the lock file. DuckDB's own lock still protects the store."""
     if fcntl is None:
         return
     try:

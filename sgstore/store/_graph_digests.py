@@ -154,7 +154,7 @@ def graph_digests(file: StoreFile, frames: Sequence[Ints], *, older: bool = Fals
 
 
 def _tables(file: StoreFile) -> dict[str, str]:
-    """Return SQL for the rows of each table with all values as numbers: table → subquery."""
+    """Return SQL for the rows of each table, with all values as numbers: table → subquery."""
     found: dict[str, str] = {}
     with file.access.reading() as connection:
         for table, (names, condition) in _COLUMNS.items():
@@ -193,7 +193,7 @@ def _frame_words(file: StoreFile, tables: dict[str, str], frame_id: Ints) -> tup
 
 
 def _hashed(file: StoreFile, table: str, values: dict[str, Any]) -> tuple[int, Words]:
-    """Return the smallest row id of a table, and the hashes of its rows by their offset from this id."""
+    """Return the hashes of a table's rows as an array by row id, and the row id of the first hash."""
     bounds = {name: values[name] for name in ("first", "last")}
     rows = file.arrays(f"FROM {table}", bounds, plain=True)
     number = rows.pop("row").astype(np.int64)
@@ -213,7 +213,7 @@ def _of_rows(hashed: tuple[int, Words], number: NDArray[Any]) -> NDArray[Any]:
 
 
 def _by_frame(place: Ints, mask: Ints, hashes: Words, count: int) -> Words:
-    """Return the sum of row hashes for each frame, (64 B,), in ``count`` = B buckets of 64 frames."""
+    """Return the sum of row hashes for each frame, (64 B,). B counts the buckets of 64 frames."""
     sums = np.zeros(count << FRAME_BITS, np.uint64)
     first, behind = place << FRAME_BITS, mask << 1
     _add_at_bits(sums, first, mask & ~behind, hashes)
@@ -222,7 +222,7 @@ def _by_frame(place: Ints, mask: Ints, hashes: Words, count: int) -> Words:
 
 
 def _add_at_bits(sums: Words, first: Ints, bits: Ints, words: Words) -> None:
-    """Add the hash of each row to the sums at its set bits. ``first`` is the index of bit 0 of each row."""
+    """Add each row's hash to ``sums`` at the set bits of its mask. Bit 0 is at the index ``first``."""
     while len(bits):
         low = bits & -bits
         np.add.at(sums, first + np.bitwise_count(low - 1), words)

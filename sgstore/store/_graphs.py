@@ -126,7 +126,7 @@ _EDGES_TOGETHER: Final = 2_000_000
 
 
 class Graphs:
-    """Reader of the graphs of a store, as columns of many frames or as scene graphs.
+    """Reader of the graphs in a store, as columns for many frames or as scene graphs.
 
     Recently used maps are cached.
     """
@@ -151,7 +151,7 @@ class Graphs:
     def of_frames(
         self, connection: DuckDBPyConnection, first: int, last: int
     ) -> tuple[NDArray[np.int64], GraphColumns]:
-        """Return frame numbers and graphs of a range of frame ids in one trace."""
+        """For a range of frame ids in one trace, return the frame numbers and the graphs."""
         rows = connection.execute(_FRAMES, {"first": first, "last": last}).fetchnumpy()
         ids = rows["frame_id"].astype(np.int64)
         trace_id = first >> SEQ_BITS
@@ -162,7 +162,7 @@ class Graphs:
     def of_ids(
         self, connection: DuckDBPyConnection, frame_id: NDArray[np.int64]
     ) -> Iterator[tuple[NDArray[np.int64], GraphColumns]]:
-        """Yield graphs for ascending frame ids of any traces, with their indices in the input.
+        """Yield the graphs of frames in groups, with each frame's index in the input. Frame ids must ascend.
 
         Frames with about two million edges are read at once. Frames on one map form one :class:`GraphColumns`.
         """
@@ -181,7 +181,7 @@ class Graphs:
         ids: NDArray[np.int64],
         trace_id: int | None = None,
     ) -> tuple[list[tuple[NDArray[np.int64], GraphColumns]], int]:
-        """Return the graphs of some frames, grouped by road map, and the number of edges.
+        """Return the graphs of some frames, grouped by road map, and the total number of edges.
 
         Frames without a map form one group.
 
@@ -307,7 +307,7 @@ def _remembered(maps: OrderedDict[str, T], digest: str, read: Callable[[], T]) -
 def _asked(
     frame_id: NDArray[np.int64], otherwise: int = 0
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the SQL parameters for a selection of frames twice: as frame ids, and as bit masks of 64 frames.
+    """Return the SQL parameters of a frame selection in two forms: frame ids, and bit masks of 64 frames.
 
     ``otherwise``: bounds without any frame.
     """
@@ -327,7 +327,7 @@ def _asked(
 def _records(
     connection: DuckDBPyConnection, sql: str, values: dict[str, Any]
 ) -> Iterator[tuple[tuple[int, ...], dict[str, Any]]]:
-    """Run SQL, and yield each row as (frame id, node ids) and a dict of its non-null attributes."""
+    """Run SQL. Yield each row as its ids (frame id, node ids) and a dict of its non-null attributes."""
     found = run(connection, sql, values)
     ids = sum(name in {"frame_id", "node_id", "src", "dst"} for name in found.columns)
     names = found.columns[ids:]
@@ -344,7 +344,7 @@ def _own_attributes(
     frame_id: NDArray[np.int64],
     of_edges: dict[tuple[int, int, int, int], dict[str, Any]],
 ) -> dict[int, list[tuple[int, str, Any]]]:
-    """Return user-defined node attributes by frame, and add edge attributes to a given dict."""
+    """Return the user-defined attributes of nodes by frame. Add those of edges to the dict ``of_edges``."""
     of_nodes: dict[int, list[tuple[int, str, Any]]] = {}
     for frame, node, relation, dst, name, text in run(connection, _OWN, by_frame).values:
         value = json.loads(text)
@@ -417,7 +417,7 @@ class _Traces:
         return cls(found["trace_id"].astype(np.int64), origin, found["map_id"].astype(np.int64))
 
     def rows(self, frame_id: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return, for each frame, the row of its trace in the table of traces."""
+        """For each frame, return the row of its trace in the table of traces."""
         return np.searchsorted(self.trace_id, trace_of(frame_id)).astype(np.int64)
 
 
@@ -427,7 +427,7 @@ def _each_frame(of: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
 
 
 def _by_map(of: dict[str, NDArray[Any]], number: Numbers, maps: int) -> list[dict[str, Any]]:
-    """Split table rows by the road map of their frame. Frames are numbered from 0 in each part."""
+    """Split table rows by the road map of their frame. Each part numbers its frames from 0."""
     if maps == 1:
         return [of]
     frame = np.empty(len(number), np.int64)

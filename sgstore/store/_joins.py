@@ -126,7 +126,7 @@ class UserTable:
 
 @dataclass(frozen=True, slots=True)
 class JoinedTable:
-    """Result of the join of a user table with the frames of a store: numbers of rows.
+    """How the rows of a user table match the frames of a store: numbers of rows.
 
     Attributes
     ----------

@@ -87,7 +87,7 @@ def _wanted(path: Path) -> bool:
 
 
 class AttachedFile:
-    """Read-only store file, attached to a DuckDB instance that the stores of one folder share.
+    """Read-only store file in a DuckDB instance that all stores of its folder share.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ class AttachedFile:
         self._instance.cursor().execute(told)
 
     def cursor(self, schema: str = "") -> DuckDBPyConnection:
-        """Return a connection to the store file that resolves names in the given schema."""
+        """Return a connection to the store file. Names without a schema belong to the given schema."""
         connection = self._instance.cursor()
         if schema:
             connection.execute(f"USE {quoted(self.name)}.{schema}")
@@ -136,7 +136,7 @@ _instances_lock = threading.Lock()
 def shared_instance(
     key: tuple[object, ...], make: Callable[[], DuckDBPyConnection]
 ) -> DuckDBPyConnection:
-    """Return the DuckDB instance for a key, created at the first call. Callers use only cursors of it."""
+    """Return the DuckDB instance for a key. The first call creates it. Callers must use cursors of it."""
     with _instances_lock:
         if key not in _instances:
             _instances[key] = make()
@@ -232,7 +232,7 @@ class OpenFile:
             self.close()
 
     def let_go(self, token: object) -> None:
-        """Unregister an object that uses the store file. The last one closes the file."""
+        """Unregister an object that uses the store file. Close the file if no other object uses it."""
         self.holders.discard(token)
         # An object may be deleted at any time and in any thread, so this code must not wait. The watcher also
         # checks.

@@ -260,7 +260,7 @@ class Access:
             self._file.close()
 
     def _damage(self, connection: DuckDBPyConnection, error: Exception) -> str:
-        """Return the damage of the store that caused an internal DuckDB error; empty without damage."""
+        """If damage of the store caused an internal DuckDB error, return its description; otherwise empty."""
         if self._diagnose is None:
             return ""
         trace = error.__traceback__

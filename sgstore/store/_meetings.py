@@ -1,4 +1,4 @@
-"""Criticality measures of whole traces between an object and all other objects, computed in windows.
+"""Criticality measures over whole traces, between an object and all other objects.
 
 Notes
 -----
@@ -74,7 +74,7 @@ _Traces: TypeAlias = "Mapping[str, NDArray[Any]]"
 
 
 class BoundedCache(OrderedDict[Any, _T]):
-    """Cache of values with sizes in bytes. The oldest values are dropped beyond a total size."""
+    """Cache of values with their sizes in bytes. It drops the oldest values above a total size."""
 
     def __init__(self, most: int) -> None:
         super().__init__()
@@ -91,7 +91,7 @@ class BoundedCache(OrderedDict[Any, _T]):
 
 
 class RecordedValues:
-    """Recorded criticality measures of object pairs in a store file that does not change."""
+    """Cache of criticality measures of object pairs over whole traces. The store file must not change."""
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
@@ -102,13 +102,13 @@ class RecordedValues:
         self._ahead = 1
 
     def known(self, scope: str, measure: str, trace: int, src: int) -> bool:
-        """Return True if a measure of an object is in the cache."""
+        """Return True if the cache has the values of a measure for an object."""
         return (scope, measure, trace, src) in self._known
 
     def value(
         self, reader: DuckDBPyConnection, scope: str, measure: str, pair: tuple[int, int, int]
     ) -> float | None:
-        """Return a measure of a trace and two of its objects. ``None`` means unknown or undefined.
+        """Return a measure for two objects of a trace; ``None`` if it is unknown or undefined.
 
         Parameters
         ----------
@@ -132,7 +132,7 @@ class RecordedValues:
     def _compute(
         self, reader: DuckDBPyConnection, scope: str, measure: str, trace: int, src: int
     ) -> None:
-        """Compute a measure of an object with all others. For an ego, compute it for the next traces, too."""
+        """Compute a measure of an object with all others. For an ego, also compute the next traces' egos."""
         if not self._traces:
             self._traces = reader.execute(_TRACES).fetchnumpy()
             self._egos = {one: min(nodes) for one, nodes in _egos(reader).items()}
@@ -184,7 +184,7 @@ def _egos(reader: DuckDBPyConnection) -> dict[int, list[int]]:
 
 
 def meetings(reader: DuckDBPyConnection, measures: Sequence[str]) -> Iterator[Meetings]:
-    """Yield the encounters of the egos and all other known objects, for windows of traces and some measures."""
+    """For each ego, yield its encounters with all other known objects, a group of traces at a time."""
     egos, traces = _egos(reader), reader.execute(_TRACES).fetchnumpy()
     window = np.cumsum(traces["states"]) // MOST_STATES
     for rows in np.split(np.arange(len(window)), np.flatnonzero(np.diff(window)) + 1):
@@ -203,7 +203,7 @@ def _meetings(
     cache: BoundedCache[_States] | None = None,
     measures: Sequence[str] = (*Meetings.of_motion,),
 ) -> Iterator[Meetings]:
-    """Yield the encounters of one object of each trace with the other objects, in one or more parts."""
+    """For one object of each trace, yield its encounters with the other objects, in one or more parts."""
     ids = traces["trace_id"]
     parts = max(-(-int(traces["states"].sum()) // MOST_STATES), 1) if len(sources) == 1 else 1
     ends = [int(ids[0]) << SEQ_BITS, ((int(ids[-1]) + 1) << SEQ_BITS) - 1]
@@ -232,7 +232,7 @@ def _meetings(
 def _read(
     reader: DuckDBPyConnection, sql: Sequence[str], traces: _Traces, limits: Sequence[int]
 ) -> _States:
-    """Return frame, node id and place in the states of all objects in some traces, and these states."""
+    """Return the object states of some traces: frames, node ids, indices into the states, and the states."""
     moving, standing = (reader.execute(one, limits).fetchnumpy() for one in sql)
     frames, nodes = (
         np.ma.getdata(moving[name]).astype(np.int64) for name in ("frame_id", "node_id")

@@ -136,7 +136,7 @@ class PartFile:
     def of_classes(
         file: StoreFile, abstraction: str, traces: Sequence[int], table: str, to: Path
     ) -> PartFile:
-        """Write the frame classes of an abstraction to a file, for some traces or for a user table.
+        """Write the class names of some traces, or of the frames in a user table, to a file.
 
         Parameters
         ----------

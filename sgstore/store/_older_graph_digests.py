@@ -85,7 +85,7 @@ def older_graph_digests(file: StoreFile, frames: Sequence[Ints]) -> list[str]:
 
 
 def _windows(sizes: Sequence[int]) -> Iterator[tuple[int, int]]:
-    """Yield ranges of groups to read at once: at least one group, and up to :data:`GRAPHS` frames."""
+    """Yield ranges of groups. A range has at most :data:`GRAPHS` frames, or is a single larger group."""
     low = together = 0
     for high, size in enumerate(sizes):
         if together + size > GRAPHS and high > low:

@@ -58,7 +58,7 @@ class NodeKinds:
     map: Codes
 
     def learn(self, entities: Entities) -> None:
-        """Add the kinds of new objects. Their order is that of the node ids."""
+        """Add the kinds of new objects. The objects must be in the order of their node ids."""
         if len(entities) and entities.first != len(self.entities):
             raise ValueError(f"new entities begin at {entities.first}, not {len(self.entities)}")
         self.entities = np.concatenate([self.entities, entities.kind])
@@ -72,7 +72,7 @@ class NodeKinds:
 
 
 def masks_of(keys: Sequence[Whole], bits: Whole) -> tuple[NDArray[np.intp], Ints]:
-    """Merge rows with equal keys into one row, and combine their bit numbers into a bit mask.
+    """Merge rows with equal keys. The bit numbers of the merged rows become one bit mask.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def masks_of(keys: Sequence[Whole], bits: Whole) -> tuple[NDArray[np.intp], Ints
 
 
 def packed(keys: Sequence[NDArray[Any]]) -> Ints | None:
-    """Combine key columns into one integer column with the same order. ``None`` if they need too many bits.
+    """Combine key columns into one integer column with the same order; ``None`` if this is impossible.
 
     Parameters
     ----------
@@ -143,7 +143,7 @@ def frame_columns(graph: GraphBlock, trace_id: int) -> Columns:
 def state_columns(
     graph: GraphBlock | WorldBlock, trace_id: int, kinds: NodeKinds, origin: Origin
 ) -> Columns:
-    """Return the variable states of objects in each frame as columns. Kinds and light states are codes."""
+    """Return the object states of each frame (position, speed, …) as table columns. Kinds are codes."""
     frames, states = graph.frames, graph.frames.states
     row = frames.frame_of
     plain = {name: getattr(states, name) for name in KEPT}
@@ -170,7 +170,7 @@ def state_columns(
 def own_attributes(
     graph: GraphBlock | WorldBlock,
 ) -> list[tuple[int, int, int, int, str, str]]:
-    """Return the attributes of objects without a column, as rows of :meth:`Segment.keep_attributes`."""
+    """Return the object attributes without a table column, as rows of :meth:`Segment.keep_attributes`."""
     frames, states = graph.frames, graph.frames.states
     frame_of = frames.frame_of
     rows = (row for row, own in enumerate(states.own.tolist()) if own)

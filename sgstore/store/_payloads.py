@@ -57,7 +57,7 @@ class Periods:
             self.counts[channel] = count + len(piece)
 
     def of(self, channel: int) -> float:
-        """Return the median time between messages of a channel; ns. Fewer than two messages give 0."""
+        """Return the median time between messages of a channel; ns. With fewer than two messages, it is 0."""
         times = np.sort(np.concatenate(self.times.get(channel, [np.zeros(0, np.int64)])))
         return float(np.median(np.diff(times))) if len(times) > 1 else 0.0
 
@@ -108,7 +108,7 @@ def joined(
 
 
 class FrameTimes:
-    """Log times of the frames of a trace, with their ascending order.
+    """Log times of a trace's frames, and the indices that sort them.
 
     Parameters
     ----------
@@ -192,7 +192,7 @@ def _none(count: int) -> Ints:
 
 
 def _better(one: Ints, other: Ints, *, later: bool) -> Ints:
-    """Choose the later or the earlier of two messages for each frame, by log time and then by position.
+    """For each frame, choose the later or earlier of two messages by log time, then by file position.
 
     At equal times, the message with the later file position is chosen.
     """

@@ -1,4 +1,4 @@
-"""Copy of some frames of a store as a plain DuckDB file, also for older versions of DuckDB."""
+"""Copy of some frames in a plain DuckDB file, which older versions of DuckDB can read, too."""
 
 from __future__ import annotations
 

@@ -235,7 +235,7 @@ def insert(
 
 
 def _buffers(tables: TableFile, table: str) -> Columns:
-    """Return uninitialised columns for the largest group of rows that is inserted at once."""
+    """Return uninitialised arrays for a table's columns, as long as the largest group of rows to insert."""
     pieces, types = tables.pieces(table), types_of(table)
     size = min(sum(piece.rows for piece in pieces), PIECE_ROWS)
     return {
@@ -245,7 +245,7 @@ def _buffers(tables: TableFile, table: str) -> Columns:
 
 
 def _filled(tables: TableFile, table: str, staged: Columns) -> Iterator[int]:
-    """Write rows of a table into given arrays, group by group. Yield the number of rows of each group."""
+    """Fill the given arrays with the next rows of a table, again and again. Yield the row count each time."""
     size, count = len(next(iter(staged.values()))), 0
     for piece in tables.pieces(table):
         first = 0
@@ -262,7 +262,7 @@ def _filled(tables: TableFile, table: str, staged: Columns) -> Iterator[int]:
 
 
 def _value(table: str, name: str, values: NDArray[Any]) -> str:
-    """Return SQL of a prepared column: enumeration values from codes, and NULL for missing values."""
+    """Return SQL that converts a prepared column: codes to enumeration values, missing values to NULL."""
     if values.dtype.kind == "O":
         return f"nullif(\"{name}\", '')" if values.any() else "NULL"
     enum = shape.enums_of(table).get(name)
@@ -374,7 +374,7 @@ STEP: Final = 64
 
 @contextmanager
 def writing(access: Access) -> Generator[DuckDBPyConnection]:
-    """Context manager of one transaction. It yields a database connection with the store as ``store``."""
+    """Context manager of a write transaction. It yields a connection with the store attached as ``store``."""
     with scratch(spill_folder()) as connection, access.writing(connection):
         yield connection
 
@@ -390,7 +390,7 @@ def add(connection: DuckDBPyConnection, path: Path, staging: Staging) -> None:
 
 
 def note(connection: DuckDBPyConnection, trace_id: int, tables: Iterable[str]) -> None:
-    """Update the stored checksums of a trace for tables that changed after its publication."""
+    """Compute the checksums of changed tables of a published trace anew, and store them."""
     sql = "SELECT frames FROM store.inside.trace WHERE trace_id = ?"
     frames = sum(n for (n,) in connection.execute(sql, [trace_id]).fetchall())
     first = trace_id << BUCKET_BITS
@@ -419,7 +419,7 @@ def checksums(
     only: int | None = None,
     count: Callable[[int], None] | None = None,
 ) -> dict[int, Checksum]:
-    """Return the checksums of the rows of a table, by trace or by another owner.
+    """Return one checksum of a table's rows per owner: a trace, or a recording, settings or map.
 
     Parameters
     ----------
@@ -454,7 +454,7 @@ def checksums(
 
 
 def _add(found: dict[int, Checksum], owner: Ints, hashes: Words) -> None:
-    """Add row hashes to the checksums of their owners. It is fast if the rows of one owner are adjacent."""
+    """Add row hashes to the checksums of their owners. This is fast if each owner's rows are adjacent."""
     starts = np.flatnonzero(np.diff(owner, prepend=owner[:1] - 1))
     ids, place = np.unique(owner[starts], return_inverse=True)
     sums, counts = np.zeros(len(ids), np.uint64), np.zeros(len(ids), np.int64)

@@ -63,7 +63,7 @@ class OldTrace:
 
 @dataclass(frozen=True, slots=True)
 class OldMap:
-    """Road map of a store that is to be rebuilt. A map of named parts has no text."""
+    """Road map of a store that is to be rebuilt. The text is empty if the store has no text of the map."""
 
     name: str
     digest: str

@@ -29,13 +29,13 @@ if TYPE_CHECKING:
 
 @contextmanager
 def replayed_topics(recording: Recording) -> Generator[ReplayedTopics]:
-    """Context manager with the topics of an open recording. Their decoded messages are in a folder."""
+    """Context manager that yields the topics of an open recording. At the end, it deletes decoded messages."""
     with working_folder("topics") as folder:
         yield ReplayedTopics(recording, folder)
 
 
 class ReplayedTopics:
-    """Topics of an open recording. Messages are decoded once, and several topics in one walk.
+    """Topics of an open recording. One pass decodes the messages of several topics, each message once.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ class ReplayedTopics:
     def values(
         self, asked: Iterable[TopicValue], time_ns: Ints, log_time_ns: Ints
     ) -> dict[TopicValue, list[Any]]:
-        """Return the values of topics at all frames, as a store has them. ``None`` means unknown.
+        """Return the values of topics at all frames, as a store has them; ``None`` if unknown.
 
         Parameters
         ----------

@@ -62,7 +62,7 @@ class Tabular:
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
-            """Raise an error for an unknown attribute, with the right method for names of other libraries."""
+            """Raise an error for an unknown attribute. If the name is from another library, name the method."""
             instead = _OTHER_WORDS.get(name)
             hint = f"; write {instead}()" if instead else ""
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}{hint}")
@@ -143,7 +143,7 @@ class Tabular:
         return polars.DataFrame([polars.Series(name, of, strict=False) for name, of in columns])
 
     def _by_values(self) -> Any:
-        """Return the result as an Arrow table with types from its Python values. ``None`` if impossible."""
+        """Return the result as an Arrow table with types from its Python values; ``None`` if impossible."""
         with suppress(MissingExtraError):
             package("pyarrow")
             table = self._table()

@@ -96,7 +96,7 @@ class Shape:
 
 @cache
 def expected(*wider: tuple[str, Tokens]) -> Shape:
-    """Return tables, views and types as ``schema.sql`` creates them. Enumerations can be extended."""
+    """Return the tables, views and types of ``schema.sql``. Types in ``wider`` replace those of equal name."""
     tables: dict[str, Tokens] = {}
     types: dict[str, Tokens] = {}
     views: dict[str, dict[str, str]] = {"main": {}, INSIDE: {}}
@@ -141,7 +141,7 @@ _TRACE: Final = re.compile(
 
 
 def add_trace(connection: DuckDBPyConnection, database: str = "") -> None:
-    """Add the column ``trace`` to the views of an older store, and the views that it lacks.
+    """To an older store, add the column ``trace`` of the views, and the views that it lacks.
 
     A store in which a user's table has the name of a new view is not changed.
 
@@ -259,7 +259,7 @@ TOPIC_TYPES: Final[frozenset[str]] = frozenset(
 
 
 def topic_statements(tables: Iterable[tuple[str, str]]) -> dict[str, str]:
-    """Return the tables of topics: name → statement that creates it, without ``CREATE TABLE``.
+    """Return the statement of each topic table: table name → statement without ``CREATE TABLE``.
 
     ``tables``: names and statements of tables. Only tables of plain columns count: a store is not trusted.
     """
@@ -272,7 +272,7 @@ def topic_statements(tables: Iterable[tuple[str, str]]) -> dict[str, str]:
 
 
 def _plain_columns(words: Tokens) -> str:
-    """Return the columns of a CREATE TABLE statement. Empty if a column has more than a name and plain type."""
+    """Return the columns of a CREATE TABLE statement; empty if a column is more than a name and plain type."""
     *inner, end = words[4:] if words[-1] != ";" else words[4:-1]
     found: list[str] = []
     column: list[str] = []
@@ -290,7 +290,7 @@ def _plain_columns(words: Tokens) -> str:
 
 
 def _without_topics(objects: Objects) -> Objects:
-    """Return the objects of a store except its tables of topics, which are optional."""
+    """Return the objects of a store without the tables of topics, which are optional."""
     told = {
         (name, str(sql))
         for what, schema, name, sql in objects
@@ -314,7 +314,7 @@ def _about(
 def about_store(
     connection: DuckDBPyConnection, database: str, objects: Objects
 ) -> dict[str, str] | None:
-    """Return version and digest of a store's schema. ``None`` means that the file is not a store."""
+    """Return version and digest of a store's schema; ``None`` if the file is not a store."""
     schema = schema_of(objects)
     told = _info_of(objects).get(schema)
     if told is None:
@@ -353,7 +353,7 @@ def _info_of(objects: Objects) -> dict[str, str]:
 
 
 def other_version(about: dict[str, str]) -> str:
-    """Return the error message for a store of another schema version; empty for the same version."""
+    """If a store has another schema version, return the error message; otherwise an empty text."""
     held, maker = (
         excerpt(about.get("schema_version", "unknown")),
         excerpt(about.get("created_by", "an unknown version")),
@@ -388,7 +388,7 @@ def _altered(connection: DuckDBPyConnection, database: str, objects: Objects) ->
 
 
 def _any_changed(connection: DuckDBPyConnection, objects: Objects) -> tuple[str, ...]:
-    """Return the faults of a store, compared with the current or the older views."""
+    """Compare a store with the current and the older views. Return the shorter list of faults."""
     views = _expected_views(connection)
     older = (
         {

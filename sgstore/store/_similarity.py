@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class SimilarFrames:
-    """Run of consecutive frames of a trace that are equally similar to the example frame of a search.
+    """Consecutive frames of a trace that are equally similar to the example frame of a search.
 
     Attributes
     ----------
@@ -175,7 +175,7 @@ BESIDE_S: Final = 5.0
 
 
 def _beside(connection: DuckDBPyConnection, frame: FrameRef) -> tuple[int, int]:
-    """Return the numbers of the first and the last frame that are close in time to the given frame."""
+    """Return the numbers of the first and last frame within :data:`BESIDE_S` of the given frame."""
     sql = "SELECT min(seq), max(seq) FROM frames WHERE trace_id = ? AND abs(t - ?) < ?"
     found = connection.execute(sql, [frame.trace_id, frame.t, BESIDE_S]).fetchone()
     return found or (0, -1)
@@ -183,7 +183,7 @@ def _beside(connection: DuckDBPyConnection, frame: FrameRef) -> tuple[int, int]:
 
 @dataclass(frozen=True, slots=True)
 class _Runs:
-    """Runs of consecutive frames with equal features, each as one row.
+    """Runs of consecutive frames with equal features. Each run is one row.
 
     Attributes
     ----------
@@ -236,7 +236,7 @@ class _Compared:
     same: NDArray[np.int8]
 
     def runs(self, trace_ids: Sequence[int], example_trace: int, beside: range) -> _Runs:
-        """Join consecutive frames with equal features. Leave out frames of the example's trace in a range."""
+        """Return the runs of consecutive frames with equal features, without frames close to the example."""
         trace_id = self.frame_id >> SEQ_BITS
         out = (trace_id == example_trace) & (self.seq >= beside.start) & (self.seq < beside.stop)
         differs = np.ones(len(trace_id), np.bool_)
@@ -260,7 +260,7 @@ class _Compared:
 
 
 def _compared(connection: DuckDBPyConnection, example: Example) -> _Compared:
-    """Compare all frames with an example. Isomorphic graphs have equal features.
+    """Compute the similarity of each frame to an example. Isomorphic graphs have equal features.
 
     So one frame of each class is read. Frames without a stored class are read one by one.
     """
@@ -295,7 +295,7 @@ def _compared(connection: DuckDBPyConnection, example: Example) -> _Compared:
 def _described(
     connection: DuckDBPyConnection, runs: _Runs, traces: Sequence[StoredTrace], example: Example
 ) -> Iterator[SimilarFrames]:
-    """Yield the runs with their first and last frames and with the features shared with the example."""
+    """Yield each run with its first frame, its similarity, and the features shared with the example."""
     function, counts = abstraction_named(example.abstraction).function, Counter(example.features)
     features: dict[int, Counter[str]] = {}
     ids = np.sort(runs.frame_id)

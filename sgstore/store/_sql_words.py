@@ -29,7 +29,7 @@ _KIND_COLUMNS: Final = {"kind", "src_kind", "dst_kind"}
 
 
 def world_read(sql: str) -> bool | None:
-    """True if a statement reads views of the world alone, False for views of graphs, else ``None``.
+    """True if a statement reads only ``world_…`` views, False if it reads views of graphs, else ``None``.
 
     >>> world_read("FROM pairs"), world_read("FROM world_pairs"), world_read("FROM frames")
     (False, True, None)
@@ -39,7 +39,7 @@ def world_read(sql: str) -> bool | None:
 
 
 def kind_notes(sql: str) -> tuple[str, ...]:
-    """Return notes on comparisons of ``kind`` with a group of kinds, or with an unknown word.
+    """If a statement compares ``kind`` with a group of kinds or an unknown word, return notes about it.
 
     >>> kind_notes("SELECT * FROM nodes WHERE kind = 'vru'")
     ("kind = 'vru' is a group of kinds (person, bicycle, motorcycle); write is_a(kind, 'vru')",)
@@ -66,7 +66,7 @@ def kind_notes(sql: str) -> tuple[str, ...]:
 
 
 def _compared(lower: list[str], words: list[str]) -> Iterator[tuple[str, str]]:
-    """Yield columns of kinds with the texts that they are compared with."""
+    """For each comparison of a column of kinds with a text, yield the column and the text."""
     for place, column in enumerate(lower):
         if column not in _KIND_COLUMNS:
             continue

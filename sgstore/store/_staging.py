@@ -171,13 +171,13 @@ class Staging:
         return {**self._new, "relation": relations}
 
     def shared(self) -> StagedRows:
-        """Write all tables, and return their rows for other traces. These tables must not grow afterwards."""
+        """Write all tables, and return their rows for other traces. Then no more rows may be added to them."""
         for table in [*self._waiting]:
             self.write(table)
         return StagedRows(self._file.behind(0), dict(self.checksums), dict(self._new))
 
     def adopt(self, rows: StagedRows) -> None:
-        """Add the rows that another trace has already written. Call this before all other rows."""
+        """Copy rows that another trace has written into this trace. Call this before rows are added."""
         self._file.adopt(rows.pieces)
         self.checksums.update(rows.checksums)
         self._new.update({enum: [*names] for enum, names in rows.words.items()})
@@ -258,7 +258,7 @@ class Staging:
             self._file.append(table, some, said)
 
     def _merged_runs(self, table: str, runs: list[Piece]) -> Iterator[Columns]:
-        """Merge several sorted groups of rows of a table. Yield the rows by value of the first column."""
+        """Merge sorted groups of rows of a table. Yield all rows with the same value in the first column."""
         name, texts = _RUNS[table], self._texts_of(table)
         firsts = [self._file.column(run, name) for run in runs]
         for value in np.unique(np.concatenate([np.unique(first) for first in firsts])).tolist():

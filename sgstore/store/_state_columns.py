@@ -61,7 +61,7 @@ class StateColumns:
         self._file = file
 
     def frames(self, trace: int | str, first: int, last: int) -> Columns:
-        """Return number, time since the trace start (s) and ego (-1: none) of frames, both ends included."""
+        """Return the frames ``first`` to ``last`` as columns: number, time from trace start (s), ego or -1."""
         found = self._file.arrays(
             "SELECT f.seq AS seq, round((f.time_ns - t.start_ns) / 1e3) / 1e6 AS t, coalesce(f.ego, -1) AS ego"
             " FROM frame f JOIN trace t ON t.trace_id = f.trace_id"
@@ -120,7 +120,7 @@ class StateColumns:
         return {node: tuple(about) for node, *about in rows.values}
 
     def places(self) -> dict[str, tuple[float, float, str, list[str]]]:
-        """Return coordinate origin (m), map digest and camera topics of each trace: trace name → values.
+        """For each trace, return its coordinate origin (m), map digest and camera topics: trace name → values.
 
         One statement reads all traces, because there may be thousands. Cameras are the sorted topics of
         pictures.
@@ -134,7 +134,7 @@ class StateColumns:
         return {trace: tuple(about) for trace, *about in rows.values}  # type: ignore[misc]
 
     def log_times(self, trace: int | str, first: int, last: int) -> NDArray[np.int64]:
-        """Return the log times of the messages of a range of frames; ns."""
+        """For a range of frames, return the log times of their messages; ns."""
         sql = (
             "SELECT log_time_ns FROM frame WHERE trace_id = ? AND seq BETWEEN ? AND ? ORDER BY seq"
         )

@@ -226,7 +226,7 @@ class ParquetTable:
 
     @staticmethod
     def read_rows(path: Path, columns: Sequence[str], later: str = "") -> list[tuple[Any, ...]]:
-        """Return some columns of a Parquet file as rows. The column ``later`` is NULL in older files.
+        """Return some columns of a Parquet file as rows. If a file lacks the column ``later``, it is NULL.
 
         Raises
         ------
@@ -310,7 +310,7 @@ def _type_of(values: list[Any]) -> str:
 
 
 def relation_of(write: Callable[[Path], object]) -> duckdb.DuckDBPyRelation:
-    """Call a function that writes a Parquet file, and return its rows as a DuckDB table ``answer``."""
+    """Call a function that writes a Parquet file. Return its rows as a DuckDB table ``answer``."""
     with working_folder("relation") as folder:
         file = folder / "answer.parquet"
         write(file)

@@ -31,7 +31,7 @@ _PLAIN: Final = frozenset({"|b1", "|i1", "<i2", "<i4", "<i8", "<f4", "<f8"})
 
 
 class Piece(NamedTuple):
-    """Position and size of a group of table rows in a file of tables.
+    """Position and size of one group of rows in a file of tables.
 
     Attributes
     ----------
@@ -147,7 +147,7 @@ class TableFile:
         return list(self._pieces)
 
     def read(self, piece: Piece, first: int = 0, end: int | None = None) -> Columns:
-        """Return all columns for a range of rows in a row group (block of rows) of the file.
+        """Return all columns of some rows in a row group of the file. A row group is a block of rows.
 
         Raises
         ------
@@ -159,7 +159,7 @@ class TableFile:
     def column(
         self, piece: Piece, name: str, first: int = 0, end: int | None = None
     ) -> NDArray[Any]:
-        """Return one column for a range of rows in a row group (block of rows) of the file."""
+        """Return one column of some rows in a row group of the file. A row group is a block of rows."""
         about, end = piece.columns[name], piece.rows if end is None else end
         if about["type"] not in _PLAIN:
             raise self._wrong("is not a file of sgstore")
@@ -175,7 +175,7 @@ class TableFile:
         return values.astype(np.int64) + about["base"] if "base" in about else values
 
     def values(self, piece: Piece, name: str, first: int, end: int) -> NDArray[Any]:
-        """Return one column with texts in place of text indices. An absent column has only missing values."""
+        """Return a column of a row group, with texts, not text indices. An absent column has missing values."""
         if name not in piece.columns:
             texts = types_of(piece.table)[name] in TEXTS
             count = end - first
@@ -225,7 +225,7 @@ class TableFile:
 
 
 def _narrowed(values: NDArray[Any]) -> tuple[dict[str, Any], NDArray[Any] | None]:
-    """Convert an array to a smaller integer type, or to its single value, to save disk space.
+    """Shrink a column to save disk space: to a smaller integer type, or to one value if all are equal.
 
     Return the description of the column, and the array to write.
     """

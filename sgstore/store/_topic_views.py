@@ -78,7 +78,7 @@ def show_topics(connection: DuckDBPyConnection, access: Access, sql: str) -> Non
 
 
 def _show(connection: DuckDBPyConnection, access: Access, facts: TopicFacts, topic: str) -> None:
-    """Create the views of a topic, with a name as in the statement: the ``/`` can be missing."""
+    """Create the views of a topic, named as in the statement: the ``/`` of the topic can be missing."""
     if facts.refused:
         fields_of(facts)
     with access.reading() as reading:
@@ -218,7 +218,7 @@ def converted(
 
 @contextmanager
 def _reading(path: Path, topics: Collection[str]) -> Generator[TopicReading]:
-    """Open a recording, and yield the reading of some of its topics."""
+    """Open a recording, and yield a reader of some of its topics."""
     from sgstore.readers import TopicReading, open_recording  # most queries name no topic
 
     with open_recording(path) as recording:
@@ -306,7 +306,7 @@ def topic_facts(connection: DuckDBPyConnection, access: Access) -> dict[str, Top
 
 
 def _fields(held: ref[Access], topic: str) -> Mapping[str, TopicField]:
-    """Return the fields of a topic: of the stored tables, and of one recording whose topic is not stored."""
+    """Return the fields of a topic, from stored tables and from one recording whose topic is not stored."""
     access = held()
     if access is None:
         raise StoreError("the store of these topics is closed")
@@ -335,7 +335,7 @@ def topics_in(path: Path) -> dict[str, TopicFacts]:
 
 
 def fields_in(path: Path, topic: str) -> dict[str, str] | None:
-    """Return the fields of a recorded topic: name → database type. ``None`` for JSON, to be read first."""
+    """Return the fields of a recorded topic: name → database type; ``None`` if it is JSON."""
     return _fields_at(path, mark_of(path), topic)
 
 
@@ -385,7 +385,7 @@ def topic_values(
     rule: str = "last",
     tolerance_ns: int | None = None,
 ) -> str:
-    """Return SQL that selects the value of a field at each frame: frame_id, value. Unknown values are left out.
+    """Return SQL that selects frame id and value of a topic field. Frames without a known value are left out.
 
     Parameters
     ----------
@@ -420,7 +420,7 @@ def topic_values(
 
 
 def values_text(topic: str, field: TopicField, rule: str, tolerance_ns: int | None) -> str:
-    """Return SQL that selects the value of a topic field at each frame, if the view of messages exists."""
+    """Return SQL that selects a topic field's value at each frame. The view of the topic must exist."""
     within = "" if tolerance_ns is None else f" <= {int(tolerance_ns)}"
     value = _value(field.name)
     if field.declared in {"FLOAT", "DOUBLE"}:

@@ -109,7 +109,7 @@ _FAR_NS: Final = 1 << 62
 
 
 class FrameClock:
-    """Frame times of a trace. They map the log time of a message to its frame and its simulation time.
+    """Clock of a trace. It converts the log time of a message to a frame and a simulation time.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ class FrameClock:
         return cls(*(np.ma.getdata(found[name]) for name in names.split(", ")))
 
     def columns(self, log_time_ns: Ints) -> dict[str, Ints]:
-        """Return the table columns that follow from log times: frame, run of the clock, and time."""
+        """For log times, return columns: frame, number of earlier backward clock jumps, and simulation time."""
         at = np.maximum(np.searchsorted(self.log, log_time_ns, side="right") - 1, 0)
         past = log_time_ns - self.log[at]
         rate = np.where(past >= 0, self._rate[at], 1.0)
@@ -250,7 +250,7 @@ class TopicWriter:
 
 
 def _value(name: str, declared: str, values: Any, arrays: dict[str, Any]) -> str:
-    """Register the values of a field as arrays, and return SQL of their column."""
+    """Add the values of a field to ``arrays``, and return the SQL that makes a column of them."""
     if values.ndim == 2:
         names = [f"{name}_{at}" for at in range(values.shape[1])]
         arrays |= {one: np.ascontiguousarray(values[:, at]) for at, one in enumerate(names)}

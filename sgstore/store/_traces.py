@@ -74,7 +74,7 @@ class Identity:
         road_map: RoadMap | None,
         part: tuple[float | None, float | None] = (None, None),
     ) -> Identity:
-        """Return the identity of a trace, from a recording (or a part of it), settings and road map."""
+        """Make the identity of a trace from its recording (or part of it), settings and road map."""
         settings = as_json(replace(config, ego="", egos=()).as_stored())
         return cls(
             trace_id=Identity.id_of(info.digest, info.ego),
@@ -117,7 +117,7 @@ class Identity:
 
     @staticmethod
     def id_of(digest: str, ego: str) -> int:
-        """Return a trace id that is equal in every store: 39 bits of a hash of recording digest and ego id."""
+        """Return a trace id that is equal in every store: 39 bits of a hash of recording and ego."""
         both = f"{digest}\0{ego}".encode("utf-8", "surrogatepass")
         return int.from_bytes(hashlib.sha256(both).digest()[:8], "big") >> (64 - _TRACE_BITS)
 
@@ -289,7 +289,7 @@ def place_below(store: Path, path: Path) -> str:
 def located(
     uri: str, place: str | None, size: int, store: Path | None, root: str | Path | None = None
 ) -> Path:
-    """Return the current path of a stored recording: below a root, below the store's folder, or unchanged.
+    """Find a stored recording: below a root folder, below the store's folder, or else at its old path.
 
     Parameters
     ----------
@@ -380,7 +380,7 @@ def _object(text: str) -> dict[str, Any]:
 def stored_name(
     connection: DuckDBPyConnection, identity: Identity, *, catalog: str = ""
 ) -> str | None:
-    """Return the stored name of a trace, regardless of its settings. ``None`` if it is not stored.
+    """Return the stored name of a trace, regardless of its settings; ``None`` if it is not stored.
 
     Raises
     ------
@@ -411,7 +411,7 @@ def _request_digest(text: str, settings_digest: str, map_digest: str) -> str:
 def trace_of_request(
     connection: DuckDBPyConnection, digest: str, text: str
 ) -> tuple[str, str, int, dict[str, Any]] | None:
-    """Return name, ego, frames and report of the trace that an equal ingest request of a recording produced.
+    """Find the trace that an equal ingest request produced. Return its name, ego, frames and report.
 
     A trace whose settings or map have changed since then does not count. ``None`` means no such trace.
     """
@@ -430,7 +430,7 @@ def trace_of_request(
 def already_stored(
     connection: DuckDBPyConnection, identity: Identity, *, catalog: str = ""
 ) -> str | None:
-    """Return the stored name of a trace with equal settings and map. ``None`` if it is not stored.
+    """Return the stored name of a trace with equal settings and map; ``None`` if it is not stored.
 
     Raises
     ------
@@ -550,7 +550,7 @@ def _frame(
 
 
 def _extent(connection: DuckDBPyConnection, trace_id: int) -> tuple[int, int, int, int]:
-    """Return first frame number, last frame number, start time and latest time of a trace."""
+    """Return the first and last frame number of a trace, its start time, and its latest time."""
     row = connection.execute(
         """
         SELECT min(f.seq), max(f.seq), any_value(t.start_ns), max(f.time_ns)

@@ -45,7 +45,7 @@ UserTablesGiven = Callable[[], Iterable[Given]]
 
 
 class UserSql:
-    """SQL statement of a user. Each method runs it on a connection that reads only the store and its views.
+    """SQL statement of a user. It can read only the store and its views.
 
     Parameters
     ----------

@@ -204,7 +204,7 @@ def damage(connection: DuckDBPyConnection, path: Path) -> str:
 
 
 def _content_faults(connection: DuckDBPyConnection) -> Iterator[Fault]:
-    """Yield faults of a store: unreadable settings, duplicate names or ids, and a wrong table of mask bits."""
+    """Yield faults of a store: unreadable settings, duplicate names or ids, wrong rows in ``bits``."""
     for number, text in connection.execute("SELECT config_id, settings FROM config").fetchall():
         try:
             from_dict(json.loads(text))
@@ -268,7 +268,7 @@ _ROWS_TOGETHER: Final = 500_000
 
 
 def _cuts(traces: Mapping[int, StoredTrace], published: _Published, table: str) -> Iterator[int]:
-    """Yield bucket numbers that divide the rows of a table into ranges that fit into memory."""
+    """Yield bucket numbers that divide a table into ranges that fit into memory. A bucket has 64 frames."""
     together = 0
     for trace_id, trace in sorted(traces.items()):
         rows = published.get(("trace", trace_id), {}).get(table, Checksum()).rows
@@ -286,7 +286,7 @@ def _trace_faults(
     traces: Mapping[int, StoredTrace],
     published: _Published,
 ) -> Iterator[Fault]:
-    """Yield faults of the traces in a table: rows that differ from the published rows."""
+    """For each trace, compare a table's rows with the published rows. Yield a fault for each difference."""
     found = read(table, "trace", _cuts(traces, published, table))
     for trace_id, trace in traces.items():
         then = published.get(("trace", trace_id), {}).get(table)
@@ -296,7 +296,7 @@ def _trace_faults(
 
 
 def _read_faults(read: Callable[..., object], trace_id: int) -> tuple[()]:
-    """Read the rows of one trace in a table. They have no faults if the database can read them."""
+    """Read the rows of one trace in a table. If the database can read them, return no faults."""
     read(only=trace_id)
     return ()
 

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 
 class OnMap:
-    """Data that all traces on one road map share: the cache of frame classes, and the table rows of the map.
+    """Data that all traces on a road map share: a cache of frame classes, and the map's table rows.
 
     Parameters
     ----------
@@ -305,7 +305,7 @@ class Segment:
 
     @property
     def scope(self) -> dict[str, Any]:
-        """Return counts of the object states that the settings have excluded so far, for the report.
+        """For the report, return how many object states the settings have excluded so far.
 
         An import excludes none.
         """
@@ -337,7 +337,7 @@ class Segment:
         self._staging.write("payload")
 
     def _bucket_columns(self, time_ns: Ints, period_ns: int) -> Columns:
-        """Return one row for each 64 frames: a mask of the frames, and a mask of those without a gap before."""
+        """Return one row per 64 frames, with two bit masks: the frames, and those without a gap before them."""
         seq = np.arange(len(time_ns))
         one = np.left_shift(1, seq % BUCKET_FRAMES)
         step = np.diff(time_ns, prepend=time_ns[0])
@@ -432,7 +432,7 @@ class Segment:
 
 
 def _period_ns(time_ns: Ints) -> int:
-    """Return the median time between frames (of two middle values, the smaller); ns. One frame gives 0."""
+    """Return the median time between frames (the smaller of two middle values); ns. One frame gives 0."""
     steps = np.sort(np.diff(time_ns))
     return int(steps[(len(steps) - 1) // 2]) if len(steps) else 0
 
