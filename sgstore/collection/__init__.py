@@ -1,4 +1,4 @@
-"""Collections: many store files (bundles) in a folder or object store, with the query interface of a store.
+"""Collections: many store files (bundles) in a folder or object store. Queries work as in a single store.
 
 A collection is a folder, or a prefix in an object store. It has *bundles*, which are immutable
 stores of some hundreds of traces, and a *catalogue* of their contents. ``_storage`` reads and writes

@@ -78,7 +78,7 @@ class About:
 
 
 def about(place: Place) -> About:
-    """Return the settings of a collection, or raise an error for a place without a collection.
+    """Return the settings of a collection. Without a collection at this place, raise an error.
 
     Raises
     ------
@@ -144,7 +144,7 @@ class Snapshot:
         return tuple(sorted(found, key=lambda row: natural(row["name"])))
 
     def scope(self, *, world: bool, traces: Iterable[int] | None = None) -> dict[str, Any]:
-        """Return the data that settings excluded from all or some traces of a collection, as JSON values."""
+        """Return which data the ingest settings excluded from some or all traces, as JSON values."""
         chosen = None if traces is None else frozenset(traces)
         told = (row["scope"] for row in self.traces if chosen is None or row["trace_id"] in chosen)
         return scope_of(({"scope": json.loads(one)} for one in told if one), world=world)
@@ -172,7 +172,7 @@ class Snapshot:
 
     @cached_property
     def words(self) -> dict[str, tuple[str, ...]]:
-        """Return the values that users added to each enumeration in any store of the collection."""
+        """For each enumeration, return the values that users added in any store of the collection."""
         found: dict[str, dict[str, None]] = {enum: {} for enum in NAMES}
         for _, what, word, _, _ in sorted(
             self.facts["word"], key=lambda row: (row[1], row[4], row[2])
@@ -183,7 +183,7 @@ class Snapshot:
 
     @cached_property
     def own(self) -> dict[str, dict[str, Type]]:
-        """Return the custom attributes of nodes and of edges in all bundles (store files), with their types."""
+        """Return the types of the user-defined attributes of nodes and edges in all bundles (store files)."""
         found: dict[str, dict[str, set[Type]]] = {"own": {}, "own_edges": {}}
         for _, what, word, kind, _ in self.facts["word"]:
             if what in found:
@@ -195,7 +195,7 @@ class Snapshot:
 
     @cached_property
     def topics(self) -> dict[str, dict[str, str]]:
-        """Return the topics in all bundles (store files), as for :func:`topics_of_parts`."""
+        """Return the topics of all bundles (store files): topic → field → type; see :func:`topics_of_parts`."""
         found: dict[str, dict[str, str]] = {}
         for _, what, word, kind, _ in self.facts["word"]:
             if what == "topic":
@@ -208,7 +208,7 @@ class Snapshot:
         return found
 
     def fields_of_some(self, topic: str) -> dict[str, int]:
-        """Return the fields of a topic that some bundles (store files) lack: field → number of such bundles."""
+        """For each field of a topic, return how many bundles (store files) lack it; 0 is left out."""
         with_field: dict[str, set[str]] = {}
         for bundle, what, word, _, _ in self.facts["word"]:
             if what == "topic" and json.loads(word)[0] == topic:
@@ -275,7 +275,7 @@ class Snapshot:
     def triples(
         self, name: str, matters: Callable[[Triple], bool], *, world: bool
     ) -> dict[str, frozenset[Triple]]:
-        """Return the relevant (kind, relation, kind) triples of each bundle (store file), by bundle.
+        """For each bundle (store file), return the triples (kind, relation, kind) that can matter for a query.
 
         The relations are those of a derived set, or of the ingest.
 
@@ -341,7 +341,7 @@ class Snapshot:
         return found
 
     def _derived(self, name: str, bundles: frozenset[str], whole: Catalog) -> Catalog:
-        """Return a catalog with the relations of a derived set, for the traces that have this set."""
+        """Return a catalog for a derived set of relations. It covers only the traces that have this set."""
         held = self.contents([*bundles], name)
         own = {row[2]: row for row in self.sets[name] if row[0] in bundles}
         traces = tuple(
@@ -369,7 +369,7 @@ class Snapshot:
         )
 
     def relations_of(self, name: str) -> frozenset[str] | None:
-        """Return the relations in the settings of a derived set, over all stores of the collection.
+        """Return the relations that a derived set can contain in the stores of the collection.
 
         ``None`` means unknown.
         """
@@ -412,7 +412,7 @@ def latest(place: Place) -> Snapshot:
 
 
 def read(place: Place, number: int) -> Snapshot:
-    """Return the snapshot of a collection with a number.
+    """From a collection, read the snapshot with the given number.
 
     Raises
     ------
@@ -500,7 +500,7 @@ def changed(place: Place, change: Callable[[Snapshot], tuple[T, Facts | None]]) 
 
 
 def joined(facts: Iterable[Facts]) -> Facts:
-    """Return the rows of several catalogues as one catalogue; equal settings become one row."""
+    """Join the rows of several catalogues into one catalogue. Equal settings become one row."""
     found: Facts = {table: [] for table in CATALOGUE}
     for one in facts:
         for table, rows in one.items():
@@ -532,5 +532,5 @@ def files(place: Place, known: Iterable[int]) -> set[str]:
 
 
 def _answers_of(text: str) -> tuple[str, ...]:
-    """Return the relations for which a trace has data, from the text in a catalogue."""
+    """Return the names of relations for which a trace has data, from JSON text in a catalogue."""
     return tuple(map(str, json.loads(text)))

@@ -1,4 +1,4 @@
-"""Engines that run the parts of a query in parallel: local processes, Ray or Spark.
+"""Engines: each runs the tasks of a query in parallel, by local processes, Ray or Spark.
 
 ``local:N`` uses N processes of this machine, ``local`` or ``local:1`` the current process. ``ray``
 and ``ray://HOST:PORT`` use Ray, ``spark``, ``spark:MASTER`` and ``spark://HOST:PORT`` use Spark.
@@ -72,13 +72,13 @@ _OF_QUESTIONS: Final = (QueryError, SqlError, AbstractionError, ConfigError)
 
 
 def refusal(task: Task, error: SgstoreError) -> Outcome:
-    """Return the result for a task that failed with an error which a retry would repeat."""
+    """Return the result of a failed task. The error is one that would occur again at a retry."""
     outcome = {"bundle": task["bundle"], "error": str(error)}
     return outcome | ({"wrong": plain_error(error)} if isinstance(error, _OF_QUESTIONS) else {})
 
 
 def fault_of_question(outcome: Outcome) -> SgstoreError | None:
-    """Return the error of a failed task if the query caused it.
+    """If a task failed because of the query, return the error.
 
     ``None`` means success, or an error of the bundle.
     """
@@ -179,7 +179,7 @@ class _Ray:
                 yield from ({"bundle": task["bundle"], "error": reason} for task in left)
 
     def _outcomes(self, name: str, tasks: list[Task]) -> Iterator[Outcome]:
-        """Yield the outcomes of tasks, and remove each finished task from the list."""
+        """Run tasks, and yield each result. Remove each finished task from the list."""
         pending = {self._run.remote(name, task): task for task in tasks}
         while pending:
             some, left = self._ray.wait([*pending], num_returns=1)
@@ -197,7 +197,7 @@ class _Ray:
 
 
 class _Spark:
-    """Engine that runs tasks by Spark, one partition each. Spark repeats lost tasks itself.
+    """Engine that runs tasks on Spark. Each task is a Spark partition. Spark repeats lost tasks itself.
 
     If a complete job fails, the faulty task is unknown: its tasks then run one by one.
     """
@@ -245,7 +245,7 @@ Engine = _Here | _Processes | _Ray | _Spark
 
 
 def _session(sql: Any, master: str) -> Any:
-    """Return a Spark session on a master, or on all local cores, which repeats lost tasks."""
+    """Return a Spark session on a master, or on all local cores. The session repeats lost tasks."""
     build = sql.SparkSession.builder.appName("sgstore").master(master or f"local[*,{RETRIES + 1}]")
     build = build.config("spark.task.maxFailures", RETRIES + 1).config("spark.ui.enabled", "false")
     build = build.config("spark.ui.showConsoleProgress", "false")

@@ -1,4 +1,4 @@
-"""Ingest into a collection: each recording becomes segment files, from which a later commit makes bundles.
+"""Ingest into a collection: each recording becomes segment files. A later commit makes bundles of them.
 
 Landing needs no lock and no order: the name of a segment is its content hash, so that a repeated
 landing writes the same. The digests of the recordings distribute them: each of N shards takes its
@@ -110,7 +110,7 @@ class _Landing:
     maps: set[str] = field(default_factory=set[str])
 
     def landed(self, paths: list[Path], share: int, of: int, jobs: int) -> list[TraceOutcome]:
-        """Ingest one share (``share`` of ``of``) of the recordings, and write their segment files."""
+        """Ingest one share of the recordings, number ``share`` of ``of``. Write the segment files."""
         Maps(self.job.road_map, self.job.config.signs)  # an unreadable map stops the run early
         found: dict[int, list[TraceOutcome]] = {}
         wanted: dict[int, tuple[Path, str]] = {}
@@ -139,7 +139,7 @@ class _Landing:
         self, paths: list[Path], jobs: int
     ) -> Generator[list[tuple[TraceOutcome, Path | None]]]:
         def see(*_told: int) -> None:
-            """Ignore the progress of reading."""
+            """Do nothing: progress of reading is not shown."""
 
         if min(jobs, len(paths)) > 1:
             yield from read_in_processes(self.job, jobs, see, paths, self.folder)
@@ -163,7 +163,7 @@ class _Landing:
         return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
 
     def _told(self, key: str, path: Path) -> list[TraceOutcome] | None:
-        """Return the earlier results of a recording that is already ingested with these settings, or None.
+        """If a recording is already ingested with these settings, return the earlier results.
 
         ``None`` means that it was not.
         """

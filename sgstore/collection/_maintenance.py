@@ -78,7 +78,7 @@ def verify(url: str | Path) -> CollectionFaults:
 
 
 def _differing(snapshot: Snapshot, sha: str, facts: Facts) -> list[tuple[str, str, str]]:
-    """Return the faults of catalogue tables whose rows for a bundle (store file) differ from its content."""
+    """Compare the catalogue tables with the content of a bundle (store file). Return the differences."""
     faults: list[tuple[str, str, str]] = []
     for table in CATALOGUE:
         if table == "config":
@@ -168,7 +168,7 @@ def _segment_of(name: str) -> str:
 
 
 def _last(name: str) -> bool:
-    """True for a table file of a snapshot. Such a file is removed after the snapshot itself."""
+    """True if a file is a table file of a snapshot. Table files are removed after their snapshot."""
     return not name.endswith(".json")
 
 

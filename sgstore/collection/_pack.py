@@ -66,7 +66,7 @@ class Commit:
     refused: list[str] = field(default_factory=list[str])
 
     def name(self, before: Snapshot, new: Iterable[tuple[int, str]]) -> dict[int, str]:
-        """Return a unique name for each new trace. Names do not depend on the order of arrival."""
+        """Return a unique name for each new trace. Names do not depend on the order in which traces arrive."""
         taken = {row["name"] for row in before.traces}
         names: dict[int, str] = {}
         for trace_id, name in new:
@@ -89,7 +89,7 @@ def pack(
     bundle_traces: int | None = None,
     on_bundle: Callable[[int, int], None] | None = None,
 ) -> Commit:
-    """Copy the traces of a store to a collection. A missing collection is created.
+    """Copy the traces of a store to a collection. If the collection is missing, create it.
 
     Existing traces and the store do not change.
 
@@ -138,7 +138,7 @@ def pack(
 
 
 def _lacking(store: Path, place: Place, before: Snapshot, done: Commit) -> list[tuple[int, str]]:
-    """Return the traces of a store that the collection lacks, with their names, in order of recording digest.
+    """Return the traces that the store has and the collection lacks, in order of recording digest.
 
     Raises
     ------
@@ -211,7 +211,7 @@ def put_bundle(
 
 
 def map_names(before: Snapshot, found: Mapping[str, str]) -> dict[str, str]:
-    """Return the name of each road map by digest. Maps that the collection already has keep their names."""
+    """Return the name of each road map: map digest → name. Maps of the collection keep their names."""
     names = {row["map_digest"]: row["map"] for row in before.traces if row["map_digest"]}
     taken = set(names.values())
     for digest, name in sorted(found.items()):
@@ -276,7 +276,7 @@ def refuse_others(place: Place, snapshot: Snapshot) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Landed:
-    """Ingested segment (file of one trace) in a collection that is not committed yet."""
+    """Ingested segment (file of one trace) that is not yet committed to a collection."""
 
     segment: str
     size: int
@@ -284,7 +284,7 @@ class _Landed:
 
     @property
     def of(self) -> tuple[str, str]:
-        """Return the digest of the recording, and the ego."""
+        """Return the digest of the recording, and the ego, of the segment."""
         return self.sealed.identity.digest, self.sealed.identity.ego
 
     @property
@@ -293,7 +293,7 @@ class _Landed:
 
     @property
     def read(self) -> tuple[Any, ...]:
-        """Return the settings, map digest, frame count and start time with which the segment was ingested."""
+        """Return the settings digest, map digest, frame count and start time of the segment."""
         identity, trace = self.sealed.identity, self.sealed.trace
         about = identity.settings_digest, identity.map_digest
         return *about, trace["frames"], trace["start_ns"]
@@ -396,7 +396,7 @@ def _accepted(waiting: list[_Landed], before: Snapshot, done: Commit) -> list[_L
 
 
 def _read_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    """Return the settings, map digest, frame count and start time with which a trace was ingested."""
+    """Return the settings digest, map digest, frame count and start time of a trace in a catalogue."""
     return row["config"], row["map_digest"] or "", row["frames"], row["start_ns"]
 
 

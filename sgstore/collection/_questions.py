@@ -103,7 +103,7 @@ class PartialAnswerError(StoreError):
 
 
 class Collection(StoreVerbs):
-    """Collection of many stores, with the query interface of one store.
+    """Collection of many stores. Its methods for queries are those of a single store.
 
     Parameters
     ----------
@@ -215,7 +215,7 @@ class Collection(StoreVerbs):
 
     @cached_property
     def file(self) -> CollectionFrames:
-        """Return the frames of the collection, with the interface of a store file."""
+        """Return the frames of the collection, in an object with the methods of a store file."""
         return CollectionFrames(self, lambda: self.catalog)
 
     def bundles(self) -> list[str]:
@@ -342,7 +342,7 @@ class Collection(StoreVerbs):
         return Example.best(found, limit)
 
     def pattern(self, frame: str, *, ignore: Sequence[str] = ()) -> str:
-        """Return a pattern of the surroundings of the ego in a frame; see :meth:`sgstore.Store.pattern`.
+        """Return a pattern that describes the surroundings of the ego; see :meth:`sgstore.Store.pattern`.
 
         Examples
         --------
@@ -354,7 +354,7 @@ class Collection(StoreVerbs):
         return self._at_home(frame, Store.pattern, {"frame": frame, "ignore": [*ignore]})
 
     def _at_home(self, frame: str, step: Callable[..., Any], values: dict[str, Any]) -> Any:
-        """Run a function on the bundle (store) that contains a frame. Errors are those of a single store."""
+        """Run a function on the bundle (store) that contains a frame. Raise the errors of a single store."""
         home = self._home_of(frame)
         try:
             for _, value in self.each(step, {home: values}):
@@ -492,13 +492,13 @@ class Collection(StoreVerbs):
         return {"text": "", "parameters": {}, "limit": None} | asked | about
 
     def _sent(self, path: Path) -> str:
-        """Return a user table for a task: its path, or its content for a machine without shared files."""
+        """Return a user table for a task: its path, or its content if the worker cannot read the file."""
         if self.engine.shares_files:
             return str(path)
         return "base64:" + base64.b64encode(path.read_bytes()).decode()
 
     def classes(self, questions: Iterable[ClassQuestion], folder: str | Path) -> dict[str, Path]:
-        """Write a file with the frame classes of all stores, and return its path by table name.
+        """Write a file with the frame classes that a query needs. Return its path by table name.
 
         Without abstractions, nothing is written.
         """
@@ -525,7 +525,7 @@ class Collection(StoreVerbs):
         return {CLASSES_GIVEN: path}
 
     def _counted(self, abstraction: str) -> list[tuple[str, str, str, int]]:
-        """Return the number of frames of each class in the whole collection, from the catalogue."""
+        """Return the number of frames in each scene class over the whole collection, as table rows."""
         counts: dict[str, int] = {}
         for _, of, name, frames, _ in self.snapshot.facts["class_count"]:
             if of == abstraction:
@@ -545,7 +545,7 @@ class Collection(StoreVerbs):
     def _held(
         self, catalog: Catalog, pruning: Pruning
     ) -> Callable[[str], tuple[frozenset[Triple], Sequence[frozenset[str]]]]:
-        """Return a function that returns the relevant triples and node kinds of a store."""
+        """Return a function: store name → the triples that can matter for a query, and the kinds of nodes."""
         snapshot, name, world = self.snapshot, catalog.name, catalog.world
         if name and name not in snapshot.sets:
 
@@ -568,7 +568,7 @@ def _similar(values: dict[str, Any]) -> SimilarFrames:
 
 
 def _facts_of_table(name: str, told: Mapping[str, Any]) -> TableFacts:
-    """Return the facts about a user table for the query compiler, such as how its rows match frames."""
+    """Return what the query compiler needs from a user table, such as how its rows match frames."""
     refused = None
     if not told["joins"]:
         refused = "no rows that belong to frames"
@@ -579,7 +579,7 @@ def _facts_of_table(name: str, told: Mapping[str, Any]) -> TableFacts:
 
 
 class CollectionMatches(TemporalMatches):
-    """Matches of a query in all bundles of a collection, with the interface of matches in one store.
+    """Matches of a query in all bundles of a collection. The methods are those of matches in one store.
 
     Each method runs the query again.
 
@@ -608,7 +608,7 @@ class CollectionMatches(TemporalMatches):
         yield self._ready
 
     def _exists(self, compiled: Compiled, scope: Scope) -> bool:
-        """Return True if some frame of the collection matches a pattern. Each store receives it as text."""
+        """Return True if some frame of the collection matches a pattern. The pattern is sent as text."""
         from sgstore.lang.help import pattern_text
 
         using, values = self._settings()
@@ -633,7 +633,7 @@ class CollectionMatches(TemporalMatches):
         return {name: found[name] for name in sorted(found, key=natural)}
 
     def _traces_with(self, conditions: list[Bound]) -> set[str]:
-        """Return the names of traces that meet conditions, as far as the catalogue has the attributes."""
+        """Return the traces that meet conditions, by name. Values that the catalogue lacks are not tested."""
         known = [one for one in conditions if not any(map(_is_uncatalogued, walk(one)))]
         tests = [expression(one, injective=False) for one in known]
         found: set[str] = set()
@@ -648,16 +648,16 @@ class CollectionMatches(TemporalMatches):
 
     @property
     def scope(self) -> dict[str, Any]:
-        """Return the data that settings excluded from the queried traces, as JSON values."""
+        """Return which data the ingest settings excluded from the queried traces, as JSON values."""
         chosen = (trace.trace_id for trace in self._ready.chosen)
         return self.snapshot.scope(world=self._ready.bound.world, traces=chosen)
 
     def bindings(self, frame: FrameRef) -> list[dict[str, int]]:
-        """Raise an error, because the bindings in a frame need a single store."""
+        """Raise an error: bindings in a frame can be read only from a single store."""
         raise one_store_needed(self._whole.place.url, "bindings are read from one store")
 
     def parts(self, frame: FrameRef, binding: Mapping[str, int] | None = None) -> TruthLanes:
-        """Raise an error, because the parts of a pattern need a single store."""
+        """Raise an error: the parts of a pattern can be read only from a single store."""
         raise one_store_needed(self._whole.place.url, "parts of a pattern are read from one store")
 
     def numpy(self) -> dict[str, Any]:
@@ -680,7 +680,7 @@ class CollectionMatches(TemporalMatches):
             return total
 
     def explain(self) -> str:
-        """Return an explanation of the query: its SQL stages, and the merge of the results of all stores."""
+        """Explain the query as text: its SQL stages, and how the results of all stores are merged."""
         asked = parted(self._ready)
         bundles = self._whole.may_answer(self._ready)
         text, _ = asked.statement(self._ready.catalog)
@@ -709,7 +709,7 @@ class CollectionMatches(TemporalMatches):
     def _answered(
         self, form: str, offsets: tuple[int, int] = (0, 0), *, whole: bool = False
     ) -> Iterator[tuple[Any, ...]]:
-        """Run the query, and yield the merged rows of all stores in one form (rows, frames, intervals, …)."""
+        """Run the query on all stores. Yield the merged rows in a form such as rows, frames or intervals."""
         del whole  # a bundle always runs the complete query
         result = self._ready.query.result
         cut = form in _INTERVAL_FORMS and result.form == "intervals"
@@ -722,7 +722,7 @@ class CollectionMatches(TemporalMatches):
                     yield row
 
     def written_apart(self, to: Path) -> PartFile:
-        """Write the rows of one part of a ``UNION`` to a file, with columns that distinguish equal node ids."""
+        """Write the rows of this query to a file, for a ``UNION``. More columns distinguish equal node ids."""
         asked = parted(self._ready, "apart")
         with self._tables("apart", (0, 0)) as tables:
             statement = asked.statement(self._ready.catalog)
@@ -731,7 +731,7 @@ class CollectionMatches(TemporalMatches):
 
     @contextmanager
     def _tables(self, form: str, offsets: tuple[int, int]) -> Generator[dict[str, list[PartFile]]]:
-        """Run the query on all stores, and yield their result files by table name for the merge."""
+        """Run the query on all stores. Yield the result files for the merge: table name → files."""
         with working_folder("parts") as folder:
             question = self._question(form, folder, offsets)
             tables: dict[str, list[PartFile]] = {}
@@ -751,7 +751,7 @@ _INTERVAL_FORMS: Final = {"intervals", "bound"}
 
 
 def _is_uncatalogued(part: Bound) -> bool:
-    """True for an attribute of a trace that the catalogue of a collection does not have."""
+    """True for a trace attribute that is missing from the catalogue of a collection."""
     return isinstance(part, TraceAttribute) and part.attribute.name in {"flavour", "uri"}
 
 
@@ -767,7 +767,7 @@ class CollectionUnion(UnionMatches):
 
     @property
     def scope(self) -> dict[str, Any]:
-        """Return the data that settings excluded from the traces of all parts, as JSON values."""
+        """Return which data the ingest settings excluded from the traces of all parts, as JSON values."""
         parts = [part._ready for part in self._parts]  # noqa: SLF001
         chosen = {trace.trace_id for one in parts for trace in one.chosen}
         snapshot = self._parts[0].snapshot
@@ -787,7 +787,7 @@ class CollectionUnion(UnionMatches):
 
     @contextmanager
     def _tables(self) -> Generator[tuple[Any, Any, str, list[Any]]]:
-        """Yield the rows of all parts of the union as tables, and the SQL statement that joins them."""
+        """Run each part of the union. Yield the results as tables, and the SQL statement that joins them."""
         tables, snapshot = dict[str, list[PartFile]](), self._parts[0].snapshot
         with working_folder("union") as folder:
             for number, part in enumerate(self._parts):
@@ -822,7 +822,7 @@ class CollectionChecks(CheckRun):
 
     @property
     def scope(self) -> dict[str, Any]:
-        """Return the data that settings excluded from the checked traces, as JSON values."""
+        """Return which data the ingest settings excluded from the checked traces, as JSON values."""
         world = any(one.check.world for one in self._checks)
         return self._whole.snapshot.scope(world=world)
 
@@ -901,7 +901,7 @@ class CollectionRows(Tabular):
 
     @property
     def scope(self) -> dict[str, Any]:
-        """Data that settings exclude from the views of the statement, as JSON values."""
+        """Data that the ingest settings excluded from the views of the statement, as JSON values."""
         return {} if self._world is None else self._whole.snapshot.scope(world=self._world)
 
     @property
@@ -916,7 +916,7 @@ class CollectionRows(Tabular):
 
 
 def _null_fields(whole: Collection, text: str) -> Iterator[str]:
-    """Yield a note for each topic field that an SQL statement uses, but some bundles (store files) lack."""
+    """If an SQL statement uses a topic field that some bundles (store files) lack, yield a note."""
     known = whole.catalog.topics
     selects_all = re.search(r"(?<!\()\*", text)
     for name in topics_in_sql(topic_tables(text)):
@@ -1019,11 +1019,11 @@ class CollectionFrames:
 
     @property
     def abstracted(self) -> Self:
-        """Return the collection's frames, which also have the methods for abstractions."""
+        """Return this object, which also has the methods for abstractions."""
         return self
 
     def snapshot(self) -> AbstractContextManager[object]:
-        """Return an empty context manager, because the files of a snapshot never change."""
+        """Return a context manager that does nothing, because the files of a snapshot never change."""
         return nullcontext()
 
     def arrays(self, sql: str, parameters: Parameters = ()) -> dict[str, NDArray[np.generic]]:
@@ -1058,7 +1058,7 @@ class CollectionFrames:
             yield parts
 
     def by_bundle(self, frame_id: Ints) -> list[tuple[str, tuple[Ints, Ints]]]:
-        """Return the stores that contain some frames: name, indices of its frames, and ids of its frames."""
+        """Group frames by store. Return each store's name, and the indices and ids of its frames."""
         traces, number = np.unique(trace_of(frame_id), return_inverse=True)
         homes = [self._homes[trace] for trace in traces.tolist()]
         of = {bundle: place for place, bundle in enumerate(dict.fromkeys(homes))}
@@ -1100,7 +1100,7 @@ class CollectionFrames:
             yield homes[result["bundle"]][0], Triples(names, *columns)
 
     def margins(self, question: dict[str, Any]) -> Iterator[tuple[Ints, Floats]]:
-        """Yield frame ids and robustness margins of a check, one bundle (store file) after another."""
+        """Yield the robustness margin of a check for each frame id, one bundle (store file) after another."""
         with self._parts({"kind": "margins"} | question) as parts:
             found = PartFile.merged_arrays({PARTS: parts}, self._words, _ALL, ())
         yield (
@@ -1112,7 +1112,7 @@ class CollectionFrames:
     def _parts(
         self, question: dict[str, Any], each: Mapping[str, dict[str, Any]] = MappingProxyType({})
     ) -> Generator[list[PartFile]]:
-        """Context manager with the result files of all bundles (store files) for a query.
+        """Context manager that runs a query on all bundles (store files), and yields the result files.
 
         If ``each`` has entries, only their bundles run it.
         """

@@ -129,7 +129,7 @@ class _Folder:
 
     @contextmanager
     def _beside(self, name: str) -> Generator[tuple[Path, Path]]:
-        """Yield a temporary path for a new file, and its final path. At the end, remove the temporary file."""
+        """Yield a temporary path for a new file, and its final path. At the end, delete the temporary file."""
         path = self.root / name
         path.parent.mkdir(parents=True, exist_ok=True)
         fresh = path.with_name(f".{path.name}.{secrets.token_hex(6)}")
@@ -161,7 +161,7 @@ class _Folder:
                 path.parent.rmdir()
 
     def local(self, name: str) -> Path:
-        """Return the local path of a stored file. ``None`` means that it must be copied here first."""
+        """Return the local path of a stored file; ``None`` if it must be copied to this machine first."""
         return self.root / name
 
 
@@ -223,7 +223,7 @@ CACHE: Final = "SGSTORE_CACHE"
 
 
 def cache_folder() -> Path:
-    """Return the folder for copies of remote bundles (store files), and create a missing folder.
+    """Return the folder for copies of remote bundles (store files). If the folder is missing, create it.
 
     Raises
     ------

@@ -47,7 +47,7 @@ EMPTY: Final = ""
 
 
 def _in_whole(local: Catalog, whole: Mapping[str, Any]) -> Catalog:
-    """Return the catalog of one bundle, completed by names and topics of the whole collection.
+    """Return the catalog of one bundle, with the names and topics of the whole collection added.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def _with_relations(
 
 
 class PartMatches(TemporalMatches):
-    """Matches of a query in one bundle (store file), in the forms that the merge of all bundles needs."""
+    """Matches of a query in one bundle (store file), as result files for the merge of all bundles."""
 
     def written(self, form: str, offsets: tuple[int, int], folder: Path) -> list[PartFile]:
         """Write the results of a query on one bundle (store file) to files. Return these files."""
@@ -137,7 +137,7 @@ def answer(task: dict[str, Any]) -> dict[str, Any]:
 
 
 def _known(file: StoreFile, told: str) -> Catalog:
-    """Return the catalog of a bundle (store file) for compiling queries; it is cached."""
+    """Return the catalog of a bundle (store file) for the query compiler. The catalog is cached."""
     local = file.catalog()
     held = _catalogs.get((file.path, told))
     if held is None or held[0] is not local:
@@ -152,7 +152,7 @@ _catalogs: Final[dict[tuple[Path, str], tuple[Catalog, Catalog]]] = {}
 
 @contextmanager
 def _opened(task: dict[str, Any], held: Path) -> Generator[StoreFile]:
-    """Yield a bundle (store file) as an open store. User tables and user SQL get a separate connection."""
+    """Open a bundle (store file). For user tables and user SQL, the store is opened separately."""
     if task["bundle"] == EMPTY:
         path = held / "empty.sgstore"
         StoreFile.create(path).close()
@@ -175,7 +175,7 @@ _open: Final[OrderedDict[Path, tuple[StoreFile, int]]] = OrderedDict()
 
 
 def _kept(path: Path) -> StoreFile:
-    """Return a bundle (store file) as an open store. Others are closed if all need too much memory."""
+    """Return an open bundle (store file). If all open bundles need too much memory, close the oldest."""
     if path not in _open:
         memory = (5 << 20) + path.stat().st_size // 25  # measured with 3 and with 110 MB
         _open[path] = StoreFile.together(path), memory
@@ -217,7 +217,7 @@ _of_interval, _of_robustness = _getter(Interval), _getter(Robustness)
 
 
 def _values_of(verdict: Verdict) -> list[Any]:
-    """Return a verdict as a list of values. With field names it would be three times as long."""
+    """Return a verdict as a list of values. A dict would be three times as long."""
     margin, witnesses = verdict.robustness, verdict.witnesses
     return [
         *(verdict.check, verdict.trace, verdict.verdict),
@@ -252,7 +252,7 @@ def as_verdict(values: list[Any]) -> Verdict:
 
 @dataclass(frozen=True, slots=True)
 class BundleTask:
-    """Part of a query that runs on one bundle (store file). Each kind of task is one method.
+    """Task of a query on one bundle (store file). Each kind of task is one method.
 
     Attributes
     ----------
@@ -330,7 +330,7 @@ class BundleTask:
         return _part(PartFile.of_coded(self.file, self.task["abstraction"], _fresh(self.to)))
 
     def features(self) -> dict[str, Any]:
-        """Write the features of frames (label counts of their graphs) of one bundle (store) to a file."""
+        """For one bundle (store file), write the features of its frames (counts of labels) to a file."""
         import numpy as np
 
         def rows() -> Iterator[tuple[int, str, int]]:
@@ -395,7 +395,7 @@ def like_in(store: Store, example: dict[str, Any], **how: Any) -> list[dict[str,
 
 
 def _carry(found: dict[str, Any]) -> None:
-    """Add the content of result files to a result, because the caller runs on another machine."""
+    """Put the content of result files into the result, because the caller runs on another machine."""
     for part in found.get("parts", ()):
         if not part["path"]:
             continue
