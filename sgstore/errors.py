@@ -66,12 +66,12 @@ _URL: Final = re.compile(r"(s3a?|gs|az|abfs|https?):/+(?=[^/])")
 
 
 def place_named(path: str | Path) -> str:
-    """Return the text form of a path or URL. A URL keeps both slashes, which ``Path`` merges."""
+    """Return a path or URL as text. A URL keeps its two slashes, which ``Path`` would merge."""
     return _URL.sub(r"\1://", str(path), count=1) if _URL.match(str(path)) else str(path)
 
 
 def url_named(path: str | Path) -> str | None:
-    """Return the URL in a path, or ``None`` for a local path."""
+    """If a path contains a URL, return the URL; ``None`` for a local path."""
     return place_named(path) if _URL.match(str(path)) else None
 
 
@@ -149,7 +149,7 @@ _REMEDIES: Final = {
 
 
 def reason_of(error: OSError) -> str:
-    """Return the reason of an operating system error, with the remedy if one is known.
+    """Return the reason of an operating system error as text, with the remedy if one is known.
 
     Examples
     --------
@@ -176,7 +176,7 @@ def is_interruption(error: BaseException | None) -> bool:
 
 
 def failure(error: Exception, path: str | Path) -> SgstoreError:
-    """Return the error to report for a failed recording of a batch.
+    """Return the error to report if a recording of a batch has failed.
 
     Parameters
     ----------
@@ -269,7 +269,7 @@ class SqlError(StoreError):
 
 @dataclass(frozen=True, slots=True)
 class TextSpan:
-    """Part of a query text.
+    """Range of characters in a query text.
 
     Attributes
     ----------
@@ -416,7 +416,7 @@ EXCERPT: Final = 160
 
 
 def _excerpt(line: str, start: int, length: int) -> tuple[str, str]:
-    """Return the text around an error, and a line with carets below it. Control characters become dots."""
+    """Return the text around an error, and carets below the error. Control characters become dots."""
     first = max(0, min(start - EXCERPT // 2, len(line) - EXCERPT))
     shown = line[first : first + EXCERPT]
     shown = "".join(c if c.isprintable() else " " if c.isspace() else "·" for c in shown)

@@ -1,1 +1,1 @@
-"""General tools that know nothing of driving: files, logs, quoting, markup, geometry, plugins, processes."""
+"""General tools, not about driving: files, logs, quoting, markup, geometry, plugins, processes."""

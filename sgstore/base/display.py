@@ -37,7 +37,7 @@ def cell(value: Any, longest: int = LONGEST) -> str:
 
 
 def number_of(number: int, what: str, more: str = "s") -> str:
-    """Return a count with its noun; ``more`` is the plural suffix.
+    """Return a number and a noun as text. ``more`` is the ending of the plural.
 
     >>> number_of(1, "frame"), number_of(2000, "frame"), number_of(2, "match", "es")
     ('1 frame', '2,000 frames', '2 matches')
@@ -116,16 +116,16 @@ STORE_TEXT: Final = 80
 
 
 def excerpt(text: Any) -> str:
-    """Return a text from a store for a message: one line of at most :data:`STORE_TEXT` characters."""
+    """Shorten a text of a store for a message, to one line of at most :data:`STORE_TEXT` characters."""
     return cell(str(text)[: 4 * STORE_TEXT], STORE_TEXT)
 
 
 def excerpts(names: Sequence[str], most: int = 8) -> str:
-    """Return the first names from a store for a message, and the number of the others."""
+    """Return the first names of a store as text for a message, with the number of the others."""
     return first_of([*map(excerpt, names[:most]), *names[most:]], most)
 
 
 def first_of(names: Sequence[str], most: int) -> str:
-    """Return the first names of a list, and the number of the others: ``a, b and 3 more``."""
+    """Return the first names of a list as text, with the number of the others: ``a, b and 3 more``."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return f"{', '.join(names[:most])}{more}"

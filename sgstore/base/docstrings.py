@@ -15,7 +15,7 @@ _ENTRY: Final = re.compile(r"^(\w+)(?: : (.+))?((?:\n+ +.+)+)", re.MULTILINE)
 
 @cache
 def split_docstring(documented: Any) -> tuple[str, dict[str, tuple[str, str]]]:
-    """Return the text of a docstring before its parameters, and the type and description of each parameter.
+    """Return the text before the parameters of a docstring, and each parameter's type and description.
 
     A description has one line for each paragraph.
 

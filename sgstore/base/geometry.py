@@ -54,7 +54,7 @@ def corners(boxes: Floats) -> Floats:
 
 
 def offsets(dx: Floats, dy: Floats, heading: Floats) -> tuple[Floats, Floats]:
-    """Split vectors into a part ahead and a part to the left, in axes rotated by ``heading``."""
+    """Split vectors into a part in the direction ``heading``, and a part to the left of it."""
     cos, sin = np.cos(heading), np.sin(heading)
     return dx * cos + dy * sin, dy * cos - dx * sin
 
@@ -110,12 +110,12 @@ def _meet(one: tuple[Corner, Corner], other: tuple[Corner, Corner]) -> bool:
 
 
 def _is_between(a: Corner, b: Corner, c: Corner) -> bool:
-    """Return True if point c, on the line through a and b, lies between them."""
+    """Return True if c is between a and b. The three points must be on one line."""
     return all(min(p, q) <= r <= max(p, q) for p, q, r in zip(a, b, c, strict=True))
 
 
 def _is_ahead(a: Corner, b: Corner, c: Corner) -> bool:
-    """Return True if the line from b to c continues straight in the direction from a to b."""
+    """Return True if b to c continues in the direction from a to b. The points must be on one line."""
     return (b[0] - a[0]) * (c[0] - b[0]) + (b[1] - a[1]) * (c[1] - b[1]) > 0
 
 

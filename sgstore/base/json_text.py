@@ -1,4 +1,4 @@
-"""JSON text of values, with replacements for infinite numbers and NaN, and the shortest text of numbers."""
+"""Values as JSON text. Infinite numbers and NaN are replaced, and numbers have their shortest text."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def finite(value: Any, word: Callable[[float], str | None] = lambda _: None) -> 
 
 
 def float32(number: float) -> float | None:
-    """Round a number to float32. ``None`` means that it is too large."""
+    """Round a number to float32; ``None`` if it is too large."""
     try:
         return float(struct.unpack("<f", struct.pack("<f", number))[0])
     except OverflowError:

@@ -1,4 +1,4 @@
-"""Loggers named ``sgstore.*`` for Python's logging module. Without handlers, they cost almost no time.
+"""Loggers named ``sgstore.*`` for Python's logging module. They cost almost no time without handlers.
 
 Use standard logging: ``logging.basicConfig(level="DEBUG")``, or a level and a handler for
 ``logging.getLogger("sgstore")``. The option ``--verbose`` of the command line does the same. A null handler
@@ -24,7 +24,7 @@ class _Logger:
         self._logger: Any = None
 
     def debug(self, text: str, *values: object) -> None:
-        """Log a single step, to analyse slow runs and wrong results."""
+        """Log a single step. Such messages help to analyse slow runs and wrong results."""
         self._tell("debug", text, values)
 
     def info(self, text: str, *values: object) -> None:

@@ -25,17 +25,17 @@ _seen: dict[str, float] = {"pairs": 0, "enough": WORTH}
 
 
 def count(pairs: int) -> None:
-    """Add to the number of pairs of objects that this process has handled."""
+    """Increase the number of object pairs that this process has handled."""
     _seen["pairs"] += pairs
 
 
 def worth() -> bool:
-    """Return True if compiled loops save time: after many pairs of objects, and with numba installed."""
+    """Return True if compiled loops save time: numba is installed, and the process has handled many pairs."""
     return _seen["pairs"] >= _seen["enough"] and _numba() is not None
 
 
 def use_loops(after: float = WORTH) -> bool:
-    """Use compiled loops after some number of pairs of objects. Return True if numba is installed."""
+    """Use compiled loops after the given number of object pairs. Return True if numba is installed."""
     _seen.update(pairs=0, enough=after)
     return _numba() is not None
 

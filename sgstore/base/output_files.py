@@ -299,7 +299,7 @@ def write_bytes(to: str | Path, data: bytes) -> None:
 
 @contextmanager
 def _export_errors(to: Path) -> Generator[None]:
-    """Context manager that raises errors of the operating system as :class:`ExportError`."""
+    """Context manager that converts operating system errors to :class:`ExportError`."""
     try:
         yield
     except OSError as error:
@@ -309,7 +309,7 @@ def _export_errors(to: Path) -> Generator[None]:
 
 
 def _target(to: Path) -> Path | None:
-    """Return the file that the output replaces, with links resolved. ``None`` means a pipe or open stream."""
+    """Return the file that the output replaces, with links resolved; ``None`` for a pipe or open stream."""
     try:
         about = to.stat()
     except FileNotFoundError:
@@ -364,7 +364,7 @@ def _copy(content: Path, to: Path, name: str) -> None:
 
 
 def _reserve(descriptor: int, before: int, size: int) -> None:
-    """Reserve disk space for a longer content. Without space, keep the size of the file and raise an error."""
+    """Reserve disk space for longer content. If the disk is full, restore the file size and raise an error."""
     if size <= before or not hasattr(os, "posix_fallocate"):
         return
     try:

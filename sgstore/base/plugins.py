@@ -31,7 +31,7 @@ def entry_points(group: str) -> Iterable[EntryPoint]:
 
 @dataclass(frozen=True, slots=True)
 class Registry:
-    """Registry of extensions of one kind by name: those of sgstore, then those of other packages.
+    """Registry of extensions of one kind. It finds those of sgstore, and those of other packages.
 
     Attributes
     ----------

@@ -117,7 +117,7 @@ def _listen(lines: IO[bytes], longest: int, on_line: Callable[[bytes], object]) 
 
 
 class WorkerPool:
-    """Pool of equal worker processes that share requests. As a context manager, it ends the workers.
+    """Pool of worker processes that share requests. At the end of a ``with`` block, it ends the workers.
 
     A dead worker is replaced. Requests that it has not begun go to the other workers.
 
@@ -165,7 +165,7 @@ class WorkerPool:
         return len(self._workers) < self._count or least < self._ahead
 
     def put(self, key: int, request: Mapping[str, Any]) -> None:
-        """Send a request to the worker process with the fewest requests. Its reply comes with the given key."""
+        """Send a request to the least busy worker process. :meth:`get` returns the key with the reply."""
         number = min(self._given, key=lambda one: len(self._given[one]), default=0)
         if len(self._workers) < self._count and self._given.get(number, True):
             number = self._start()
@@ -173,7 +173,7 @@ class WorkerPool:
         self._workers[number].send(request)
 
     def get(self) -> tuple[int, dict[str, Any] | int]:
-        """Return the next reply and the key of its request; an exit code if the worker died."""
+        """Return the key of a request, and its reply. If the worker died, return its exit code as the reply."""
         while True:
             number, line = self._lines.get()
             given = self._given[number]

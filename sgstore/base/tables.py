@@ -58,7 +58,7 @@ def ascending(numbers: NDArray[np.int64]) -> NDArray[np.intp]:
 
 
 def begins(*columns: NDArray[Any]) -> NDArray[np.bool_]:
-    """Return True for each row that differs from the row before it in one of the columns."""
+    """Return a mask of the rows that differ from the row before them in at least one column."""
     new = np.ones(len(columns[0]), np.bool_)
     new[1:] = np.logical_or.reduce([column[1:] != column[:-1] for column in columns])
     return new
@@ -67,7 +67,7 @@ def begins(*columns: NDArray[Any]) -> NDArray[np.bool_]:
 def spread(
     starts: NDArray[np.int64], counts: NDArray[np.int64]
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Expand index ranges (start, count). Return for each element the number of its range and its index.
+    """Expand index ranges (start, count) into their indices. Also return the range number of each index.
 
     Returns
     -------
@@ -80,7 +80,7 @@ def spread(
 
 
 def components(count: int, one: NDArray[np.int64], other: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the smallest node that is connected to each of ``count`` nodes by edges (one, other)."""
+    """Find connected nodes. For each of ``count`` nodes, return the smallest node that is connected to it."""
     least = np.arange(count)
     while True:
         before, low = least.copy(), np.minimum(least[one], least[other])

@@ -125,7 +125,7 @@ class HeldFolder:
 
 
 def sweep(parent: Path, prefix: str, undo: Callable[[Path], None] | None = None) -> None:
-    """Remove the temporary folders of processes that no longer run. ``undo`` is called before each removal."""
+    """Remove the temporary folders of ended processes. Before each removal, call ``undo``."""
     if fcntl is None:
         return
     names: list[str] = []
@@ -160,7 +160,7 @@ _mine: dict[tuple[int, Path], Path] = {}
 
 
 def temporary_folder() -> Path:
-    """Return the folder of this process for data that do not fit into memory. It is removed at exit.
+    """Return this process's folder for data that do not fit into memory. At exit, the folder is removed.
 
     If the creation fails, the folder does not exist, and later writes raise an error.
     """
