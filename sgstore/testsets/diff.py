@@ -34,7 +34,7 @@ _CHECK: Final = re.compile(r"(?:^|[;\n])\s*CHECK\b", re.IGNORECASE)
 
 
 def sources(a: Store | Collection, b: Store | Collection) -> list[str]:
-    """Return the differences of two stores in settings, road maps and versions of sgstore, as texts.
+    """Return how two stores differ in settings, road maps and versions of sgstore, as lines of text.
 
     Returns
     -------
@@ -50,7 +50,7 @@ def sources(a: Store | Collection, b: Store | Collection) -> list[str]:
 
 
 def _only(was: set[str], now: set[str]) -> str:
-    """Return the values that only one of two stores has, as text."""
+    """Compare the values of two stores. Return those that only one store has, as text."""
     only = "only " if was & now else ""
     parts = (("A", was - now), ("B", now - was))
     return ", ".join(f"{_listed(values)} {only}in {where}" for where, values in parts if values)

@@ -30,7 +30,7 @@ WHERE f.ego IS NOT NULL GROUP BY ALL ORDER BY inside, number DESC, kind
 
 
 def phrases(store: Store, frames: Sequence[str]) -> list[str]:
-    """Return a short text for each frame: the entities near the ego, and the parts of the map below it.
+    """For each frame, return a short text: the entities near the ego, and the map parts below the ego.
 
     Parameters
     ----------

@@ -63,7 +63,7 @@ class ChosenFrames:
         return tuple(self.reasons)
 
     def scope(self, *, world: bool) -> dict[str, Any]:
-        """Return the data that settings excluded from the store of the frames, as JSON values."""
+        """Return which data the ingest settings excluded from the store of the frames, as JSON values."""
         chosen = None
         if self.frame_id is not None:
             chosen = set(np.unique(trace_of(self.frame_id)).tolist())
@@ -74,7 +74,7 @@ class ChosenFrames:
 
     @property
     def one_store(self) -> Store:
-        """Return the store of the frames, or raise an error if the frames are of a collection.
+        """Return the store of the frames. If the frames are of a collection, raise an error.
 
         Raises
         ------
@@ -86,7 +86,7 @@ class ChosenFrames:
         raise one_store_needed(self.store.place.url)
 
     def joined(self, tables: Mapping[str, Path]) -> ChosenFrames:
-        """Return the same frames of the store, with more user tables for queries."""
+        """Return the same frames, with a store that has the given user tables for queries."""
         if not tables:
             return self
         if isinstance(self.store, Store):
@@ -95,7 +95,7 @@ class ChosenFrames:
 
     @property
     def abstracted(self) -> Abstracted | CollectionFrames:
-        """Return the object that computes classes and features of the frames in an abstraction."""
+        """Return the object that computes scene classes and features of the frames for an abstraction."""
         return self.store.file.abstracted
 
     @property
@@ -106,11 +106,11 @@ class ChosenFrames:
         return self.store.place.url
 
     def snapshot(self) -> AbstractContextManager[object]:
-        """Return a context manager in which several queries see the same state of the store."""
+        """Return a context manager. Several queries inside it see the same state of the store."""
         return self.store.file.snapshot()
 
     def rows_of(self, frame_id: Ints) -> Ints:
-        """Return the indices at which the selected frames are in an ascending array of frame ids."""
+        """Return the positions of the selected frames in an array of ascending frame ids."""
         if self.frame_id is None:
             return np.arange(len(frame_id))
         at = np.searchsorted(frame_id, self.frame_id)
@@ -158,7 +158,7 @@ def selection_of(
 
 
 def _place_and_query(text: str) -> tuple[str, str]:
-    """Split the text ``STORE:QUERY`` into the place of a store or collection, and the query."""
+    """Split a text such as ``STORE:QUERY`` into the path of a store or collection, and the query."""
     if url_named(text) is not None:
         colon = _BEFORE_QUERY.search(text)
         return (text, "") if colon is None else (text[: colon.start()], text[colon.end() :])
@@ -228,7 +228,7 @@ def periods_of(store: Store | Collection, frame_id: Ints) -> Floats:
 
 
 def run_begins(store: Store | Collection, frame_id: Ints, time_ns: Ints) -> Bools:
-    """Return a mask (N,) of frames that start a run: the first frame of a trace, or after a time gap."""
+    """Return a mask (N,): True for the first frame of a trace, and for a frame after a time gap."""
     step = np.diff(time_ns, prepend=time_ns[:1])
     periods, place = np.unique(periods_of(store, frame_id), return_inverse=True)
     longest = np.array([longest_step_ns(int(period)) for period in periods.tolist()])

@@ -42,7 +42,7 @@ CountedUnit = Literal["frame", "run", "trace"]
 
 @dataclass(frozen=True)
 class Classed:
-    """Selected frames with the class of each frame's scene graph, or of a window of frames.
+    """Selected frames, each with the class of its scene graph, or the class of its window of frames.
 
     Attributes
     ----------
@@ -71,16 +71,16 @@ class Classed:
         return int((self.code == UNKNOWN).sum())
 
     def sizes(self, unit: CountedUnit = "frame") -> Ints:
-        """Return the number of units (frames, runs or traces) of each class, (len(names),)."""
+        """For each class, return the number of its units (frames, runs or traces), (len(names),)."""
         code = self.code[self._units(unit)]
         return np.bincount(code, minlength=len(self.names)).astype(np.int64)
 
     def samples(self, unit: CountedUnit) -> int:
-        """Return the number of traces if a class is counted once per trace, otherwise 0."""
+        """Return the number of traces if ``unit`` is ``trace``, otherwise 0."""
         return len(np.unique(trace_of(self.frame_id))) if unit == "trace" else 0
 
     def _units(self, unit: CountedUnit) -> Ints:
-        """Return the indices of the frames that count: all frames, or one for each class and run or trace."""
+        """Return the indices of the counted frames: all, or one per class in each run or trace."""
         rows = np.flatnonzero(self.known)
         if unit == "frame" or not len(rows):
             return rows
@@ -100,14 +100,14 @@ class Classed:
         return np.flatnonzero(self.sizes())
 
     def first(self) -> Ints:
-        """Return the id of the first frame with each class, (len(names),); -1 for a class without frames."""
+        """For each class, return the id of its first frame, (len(names),); -1 for a class without frames."""
         found = np.full(len(self.names), -1)
         rows = np.flatnonzero(self.known)[::-1]
         found[self.code[rows]] = self.frame_id[rows]
         return found
 
     def in_order(self) -> Ints:
-        """Return the indices of the frames in the order of ingest of their traces, (N,)."""
+        """Return the indices that sort the frames by the ingest order of their traces, (N,)."""
         rank = {trace.trace_id: i for i, trace in enumerate(traces_of(self.chosen.store))}
         traces, number = np.unique(trace_of(self.frame_id), return_inverse=True)
         ranks = np.array([rank.get(trace, len(rank)) for trace in traces.tolist()], np.int64)
@@ -159,7 +159,7 @@ def classed(
 
 
 def _windows(whole: Classed, window: int, missing: Missing) -> Classed:
-    """Return the frames with the class of the window that ends there: the frame and the frames before it."""
+    """Give each frame the class of its window. The window is the frame and some frames before it."""
     frame_id, code = whole.frame_id, whole.code
     ids, time_ns = whole.chosen.abstracted.times()
     time_ns = time_ns[np.searchsorted(ids, frame_id)]
@@ -202,13 +202,13 @@ def _numbered(parts: Sequence[Ints]) -> tuple[Ints, Ints]:
 
 
 def _window_name(classes: Sequence[str]) -> str:
-    """Return a name for the class of a window of frames: a hash of the classes of these frames."""
+    """Return the name of the class of a window: a hash of the classes of the window's frames."""
     text = "\n".join(classes).encode()
     return blake2b(text, digest_size=16, person=b"sgstore window").hexdigest()
 
 
 def shared(*of: Classed) -> tuple[tuple[str, ...], list[Classed]]:
-    """Return several selections of frames with the same class numbers for equal classes."""
+    """Renumber the classes of several selections of frames, so that equal classes have equal numbers."""
     if all(one.names == of[0].names for one in of):  # parts of one store
         return of[0].names, list(of)
     number: dict[str, int] = {}

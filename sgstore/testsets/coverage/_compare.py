@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Statistical estimate of the number of scene classes that the data set has not shown yet.
+    """Statistical estimate of how many scene classes the data set has not shown yet.
 
     Attributes
     ----------
@@ -199,7 +199,7 @@ def unseen(found: Estimate, unit: CountedUnit) -> str:
 
 
 def covered(of: Classed, by: Classed) -> ReportTable:
-    """Return a table with the share of the classes of one selection that occur in another selection.
+    """Return a table: which share of the classes in one selection also occurs in another selection.
 
     Returns
     -------
@@ -299,7 +299,7 @@ def novel_clips(a: Classed, than: Classed) -> ReportTable:
 
 
 def venn(a: Classed, b: Classed) -> ReportTable:
-    """Return a table with the numbers of classes that two selections share, or only one selection has.
+    """Return a table of class counts: in both of two selections, and in only one of them.
 
     Returns
     -------
@@ -323,7 +323,7 @@ def venn(a: Classed, b: Classed) -> ReportTable:
 
 
 def growth(a: Classed, unit: CountedUnit = "frame", points: int = POINTS) -> ReportTable:
-    """Return a table with the number of distinct classes in the first n frames (or runs, or traces).
+    """Return a table: the number of distinct classes in the first n frames (or runs, or traces).
 
     Returns
     -------
@@ -349,7 +349,7 @@ def growth(a: Classed, unit: CountedUnit = "frame", points: int = POINTS) -> Rep
 
 
 def curve(a: Classed, unit: CountedUnit = "frame") -> tuple[Ints, Ints]:
-    """Return the number of frames of each class, and the number of distinct classes after each frame.
+    """Return the number of frames in each class and, after each frame, the number of classes so far.
 
     Runs or traces can be counted instead of frames.
 
@@ -370,7 +370,7 @@ def curve(a: Classed, unit: CountedUnit = "frame") -> tuple[Ints, Ints]:
 
 
 def rank_sizes(a: Classed, unit: CountedUnit = "frame") -> tuple[Ints, Floats]:
-    """Return the number of frames of each class, largest first, and the cumulative shares of all frames."""
+    """Return the number of units of each class, largest first, and the running sum as shares of all units."""
     sizes = np.sort(a.sizes(unit))[::-1]
     sizes = sizes[sizes > 0]
     return sizes, np.cumsum(sizes) / max(int(sizes.sum()), 1)

@@ -37,7 +37,7 @@ def tree(
     weight: Floats,
     depth: int = DEPTH,
 ) -> list[tuple[tuple[str, ...], float, float]]:
-    """Return the leaves of a decision tree that separates two groups of scenes by their features.
+    """Build a decision tree that separates two groups of scenes by their features. Return its leaves.
 
     The split criterion is Gini's impurity (Breiman et al., "Classification and regression trees",
     1984).
@@ -77,7 +77,7 @@ def tree(
 
 
 def _best(counts: NDArray[np.integer[Any]], ours: Bools, weight: Floats) -> tuple[int, int] | None:
-    """Return the best split of a decision tree: a feature, and the threshold for its number of occurrences."""
+    """Return the best split for a decision tree: a feature, and a threshold for its count."""
     good = np.where(ours, weight, 0.0)
     total, positive = float(weight.sum()), float(good.sum())
     if min(positive, total - positive) < 1e-9:
@@ -114,7 +114,7 @@ def explain(
     by_frame: bool = False,
     depth: int = DEPTH,
 ) -> tuple[ReportTable, ReportTable]:
-    """Return tables of the features, and of a decision tree, that distinguish two selections of frames.
+    """Return two tables that show how two selections of frames differ: features, and a decision tree.
 
     Parameters
     ----------
@@ -180,7 +180,7 @@ def explain(
 
 
 def _without(a: Classed, b: Classed) -> tuple[Classed, int]:
-    """Return a selection of frames without the frames of another one, and the number of removed frames."""
+    """Remove from a selection the frames of another one. Return the rest, and how many were removed."""
     if a.chosen.place != b.chosen.place:
         return a, 0
     rows = np.flatnonzero(~np.isin(a.frame_id, b.frame_id))

@@ -33,7 +33,7 @@ _ID: Final = re.compile(r"[0-9]{1,19}")
 
 
 def read_outcomes(path: str | Path, threshold: float = S3C_THRESHOLD) -> dict[str, bool]:
-    """Return test outcomes from a CSV file: True for a failure, by the name of the input.
+    """Read test outcomes from a CSV file: name of the input → True for a failure.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def read_outcomes(path: str | Path, threshold: float = S3C_THRESHOLD) -> dict[st
 def told_outcomes(
     outcomes: Mapping[str, bool], chosen: ChosenFrames, frame_id: Ints
 ) -> tuple[Bools, Bools]:
-    """Return two masks (N,) of frames: frames with a failure, and frames with a known test result."""
+    """Return two masks of the frames, (N,): with a failed test, and with a known test result."""
     failed, known = (np.zeros(len(frame_id), np.bool_) for _ in range(2))
     place = {int(frame): row for row, frame in enumerate(frame_id.tolist())}
     ids = chosen.abstracted.times()[0]
@@ -127,7 +127,7 @@ def _failed(where: str, columns: list[str], told: list[str], threshold: float) -
 def failures(
     train: Classed, test: Classed, outcomes: Mapping[str, bool]
 ) -> tuple[ReportTable, ReportTable]:
-    """Return tables of test failures: their shares, and the failures in scene classes not in training.
+    """Return two tables of test failures: shares, and failures in scene classes that training lacks.
 
     Parameters
     ----------

@@ -46,7 +46,7 @@ _ROWS: Final = 8_192
 
 @dataclass(frozen=True)
 class ClassFeatures:
-    """Counts of features in scene classes: how often each feature occurs in a graph of each class.
+    """Counts of features: how often each feature occurs in the graph of each scene class.
 
     Attributes
     ----------
@@ -67,11 +67,11 @@ class ClassFeatures:
 
     @property
     def there(self) -> Bools:
-        """Return a mask (C, F): True if a scene class has a feature."""
+        """Return a mask (C, F) for C scene classes and F features: True if the class has the feature."""
         return self.counts > 0
 
     def matrix(self, most: int) -> dict[str, Any]:
-        """Return the numbers of frames that have both features of a pair, for the most frequent features.
+        """For each pair of frequent features, return the number of frames that have both.
 
         Features of all frames are left out, because they have no gaps; and so are relations from the ego
         where relations to it are known, because most of them are the same in the other direction.
@@ -159,7 +159,7 @@ def zeros(shape: tuple[int, int], kind: np.dtype[Any]) -> NDArray[np.unsignedint
 
 
 def weighted(counts: NDArray[np.integer[Any]], weights: Floats, more_than: int = 0) -> Floats:
-    """Return the total weight (K, F) of the classes that have each feature more than ``more_than`` times."""
+    """For each feature, sum the weights of the classes with more than ``more_than`` occurrences, (K, F)."""
     total = np.zeros((len(weights), counts.shape[1]))
     # Integers below 2²⁴ are exact in 32 bits.
     small = np.abs(weights).sum() < 1 << 24 and (weights == np.round(weights)).all()
@@ -172,7 +172,7 @@ def weighted(counts: NDArray[np.integer[Any]], weights: Floats, more_than: int =
 
 @dataclass(frozen=True)
 class Combinations:
-    """Combinations of k features that occur together in frames, with their numbers of frames.
+    """Combinations of k features that occur together, with the number of frames of each.
 
     Attributes
     ----------
@@ -196,7 +196,7 @@ class Combinations:
 
     @staticmethod
     def of(found: ClassFeatures, k: int) -> Combinations:
-        """Return all combinations of k features that occur in frames, with the number of frames of each.
+        """Return all combinations of k features that occur in a frame, each with its frame count.
 
         Raises
         ------
@@ -221,7 +221,7 @@ class Combinations:
 
 
 def _counted(found: ClassFeatures, members: Ints) -> Iterator[int]:
-    """Yield the number of frames that have each combination of features."""
+    """For each combination of features, yield the number of frames that have all of them."""
     packed = np.packbits(found.there, axis=0).T.copy()
     for row in members.tolist():
         both = np.bitwise_and.reduce(packed[row], axis=0)
@@ -274,7 +274,7 @@ class Combos:
         return ReportTable(("combination", "frames"), list(listed))
 
     def matrix(self) -> tuple[list[str], Ints, Bools]:
-        """Return the names of the features, the number of frames of each pair, and a mask of required pairs."""
+        """Return names of features, frame counts for pairs of features, and a mask of required pairs."""
         own = self.found.features
         frames = _together(own)
         wanted = np.ones(frames.shape, np.bool_)
@@ -339,7 +339,7 @@ def combos(
 
 
 def over(own: ClassFeatures, names: tuple[Feature, ...]) -> ClassFeatures:
-    """Return the feature counts of classes with other columns: those of the given list of features."""
+    """Return the feature counts of classes with one column for each feature of the given list."""
     place = {name: i for i, name in enumerate(names)}
     counts = zeros((len(own.codes), len(names)), own.counts.dtype)
     for column, name in enumerate(own.names):
@@ -349,7 +349,7 @@ def over(own: ClassFeatures, names: tuple[Feature, ...]) -> ClassFeatures:
 
 
 def _together(found: ClassFeatures) -> Ints:
-    """Return the number of frames with both features of a pair, for all pairs of features, (F, F)."""
+    """For each pair of the F features, return the number of frames with both, (F, F)."""
     total = np.zeros((len(found.names), len(found.names)))
     kind = np.float32 if found.frames.sum() < 1 << 24 else np.float64  # exact for integers
     for first in range(0, len(found.codes), _ROWS):

@@ -57,7 +57,7 @@ def is_of_ego(feature: Sequence[str]) -> bool:
 
 
 def _pattern(feature: Sequence[str], lane: str) -> tuple[str, str] | None:
-    """Return the pattern of a feature, and its condition on a lane with the given variable; or None."""
+    """Return the query pattern of a feature, and its condition on a lane; ``None`` without a pattern."""
     nodes = [f"({lane}:Lane)" if label == _LANE else _node(label) for label in feature[::2]]
     if any(node is None for node in nodes):
         return None
@@ -67,7 +67,7 @@ def _pattern(feature: Sequence[str], lane: str) -> tuple[str, str] | None:
 
 
 def _node(label: str) -> str | None:
-    """Return the query pattern of a node for a node label of an abstraction; ``None`` without a pattern."""
+    """Return the query pattern for a node label of an abstraction; ``None`` if it has no pattern."""
     if label in _EGOS:
         return "(:Ego)"
     if label in _PARTS:
@@ -88,7 +88,7 @@ _TEXT: Final = re.compile(r"'(?:[^'\\]|\\.|'')*'")
 
 
 def block_of(pattern: str) -> str | None:
-    """Return the text inside ``EXISTS {…}`` for a query ``MATCH … WHERE …``; ``None`` for other clauses."""
+    """Convert a query ``MATCH … WHERE …`` to the text inside ``EXISTS {…}``; ``None`` for other clauses."""
     found = _PATTERN.fullmatch(pattern)
     if found is None or _BEYOND.search(_TEXT.sub("''", found["body"])):
         return None
@@ -155,12 +155,12 @@ SHARES = ("measure", "part", "of", "share", "denominator")
 
 
 def share(measure: str, part: float, of: float, denominator: str) -> Row:
-    """Return a table row with a share: name, both numbers, and their quotient (``None`` for x / 0)."""
+    """Return a table row: name, two numbers, and their quotient (``None`` for a division by 0)."""
     return measure, part, of, part / of if of else None, denominator
 
 
 def of_unknown(unknown: int, text: str) -> list[str]:
-    """Return a list with a note about the frames without a known class; empty without such frames."""
+    """If some frames have no known class, return a list with a note about them; otherwise an empty list."""
     if not unknown:
         return []
     return [f"{unknown} frames of {text} are too symmetric for a class; they are not counted"]

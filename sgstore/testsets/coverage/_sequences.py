@@ -38,7 +38,7 @@ WITHIN_S: Final = 10.0
 
 
 def manoeuvres_named(names: Sequence[str] = ()) -> dict[str, str]:
-    """Return the queries of manoeuvres by name, from ``NAME`` (of the library) or ``NAME=QUERY``.
+    """Return queries for manoeuvres: name → query. A name from the library or ``NAME=QUERY`` is accepted.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def manoeuvres_named(names: Sequence[str] = ()) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class ManoeuvreEvents:
-    """Starts of manoeuvres in selected frames, ordered by trace and time.
+    """Events: the starts of manoeuvres in selected frames, ordered by trace and time.
 
     Attributes
     ----------
@@ -92,7 +92,7 @@ class ManoeuvreEvents:
     said: list[str]
 
     def over(self, names: tuple[str, ...]) -> ManoeuvreEvents:
-        """Return the same manoeuvre events, numbered by the positions of their names in another list."""
+        """Return the same manoeuvre events. Their names are indices into the given list of names."""
         place = {name: i for i, name in enumerate(names)}
         moved = np.array([place[name] for name in self.names] or [0], np.int64)
         return replace(self, names=names, code=moved[self.code])
@@ -144,13 +144,13 @@ def _ascending(store: Store | Collection, frame_id: Ints, time_ns: Ints) -> Ints
 
 
 def _steps(text: str) -> int:
-    """Return the number of sequence steps of a query (of its last part for a union)."""
+    """Return the number of sequence steps in a query. For a ``UNION``, the last part counts."""
     found = [one for one in parse(text) if isinstance(one, MatchClause)]
     return len(found[-1].sequence.steps) if found else 1
 
 
 class _Cast:
-    """Names of manoeuvre events with their entities, from the traces and entity kinds of a store."""
+    """Converter of matches to manoeuvre events, with the traces and entity kinds of a store."""
 
     def __init__(self, store: Store | Collection) -> None:
         self._ids = {trace.name: trace.trace_id for trace in traces_of(store)}
@@ -175,7 +175,7 @@ class _Cast:
 
 
 def sequences_in(code: Ints, time_ns: Ints, names: int, k: int, within_ns: int) -> dict[int, int]:
-    """Return the sequences of k manoeuvres in one recording, each with the index of its first event.
+    """Find the sequences of k manoeuvres in a recording. Return the index of the first event of each.
 
     Parameters
     ----------
@@ -197,7 +197,7 @@ def sequences_in(code: Ints, time_ns: Ints, names: int, k: int, within_ns: int) 
 
 
 def _starts(code: Ints, time_ns: Ints, names: int, k: int, within_ns: int) -> dict[int, Ints]:
-    """Return the indices of the events with which each sequence begins, ascending."""
+    """For each sequence of manoeuvres, return the indices of the events that begin it, ascending."""
     time_ns = np.maximum.accumulate(time_ns)  # clocks that run backwards stay constant
     following = _following(code, time_ns, names)
     latest = time_ns + np.minimum(within_ns, np.iinfo(np.int64).max - time_ns)
@@ -223,7 +223,7 @@ def _starts(code: Ints, time_ns: Ints, names: int, k: int, within_ns: int) -> di
 
 
 def _following(code: Ints, time_ns: Ints, names: int) -> list[Ints]:
-    """Return, for each manoeuvre name, the index of its next event after each event.
+    """For each manoeuvre name, and after each event, return the index of the next event of this name.
 
     The index is the number of events if there is no later one.
     """
@@ -237,7 +237,7 @@ def _following(code: Ints, time_ns: Ints, names: int) -> list[Ints]:
 
 @dataclass(frozen=True)
 class SequenceCoverage:
-    """Tables of the sequences of manoeuvres that occur in selected frames, and of the missing sequences.
+    """Tables of manoeuvre sequences: those that occur in selected frames, and the missing ones.
 
     Attributes
     ----------
@@ -327,7 +327,7 @@ def check_sequences(names: int, k: int) -> None:
 
 
 def _in_traces(of: ManoeuvreEvents, k: int, within_ns: int) -> dict[int, tuple[int, int]]:
-    """Return, for each sequence of manoeuvres, its number of traces and the frame of its first occurrence."""
+    """For each sequence of manoeuvres, return the number of traces, and the frame where it first begins."""
     traces, first, rank = np.unique(trace_of(of.frame_id), return_index=True, return_inverse=True)
     if not len(traces):
         return {}

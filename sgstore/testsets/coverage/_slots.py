@@ -59,7 +59,7 @@ _RETURN: Final = re.compile(r"\bRETURN\b", re.IGNORECASE)
 
 
 def cells(chosen: ChosenFrames, query: str) -> tuple[tuple[str, ...], dict[tuple[Any, ...], int]]:
-    """Return the columns of a query, and the number of frames of each combination of returned values.
+    """Return the columns of a query. For each combination of returned values, return the frame count.
 
     Raises
     ------
@@ -86,7 +86,7 @@ def cells(chosen: ChosenFrames, query: str) -> tuple[tuple[str, ...], dict[tuple
 
 
 def _with_frames(query: str) -> str:
-    """Return a query that also returns the frame of each match."""
+    """Change a query so that it also returns the frame of each match. Return the changed query."""
     found = [one for one in each_match(parse(query)) if isinstance(one, syntax.MatchClause)]
     for part in reversed(found):  # insertions move the later text
         returns = part.returns
@@ -107,7 +107,7 @@ def _with_frames(query: str) -> str:
 def specification(
     chosen: ChosenFrames, query: str, declared: int = 0, reference: str | ChosenFrames = ""
 ) -> tuple[ReportTable, ReportTable, ReportTable]:
-    """Return tables of the value combinations that a query returns: existing ones and missing ones.
+    """Return tables of value combinations: those that a query returns, and the missing ones.
 
     Parameters
     ----------
@@ -192,14 +192,14 @@ class Slot:
         return (NONE, *self.values)
 
     def block(self, value: str) -> tuple[list[str], list[str]]:
-        """Return the patterns that a frame must match, and must not match, for a value of the slot."""
+        """For a value of the slot, return patterns that a frame must match, and those it must not match."""
         blocks = {name: block_of(pattern) or "" for name, pattern in self.values.items()}
         return ([], list(blocks.values())) if value == NONE else ([blocks[value]], [])
 
 
 @dataclass(frozen=True)
 class Specification:
-    """Slots (scene parameters) that a file declares, with the frames and the value combinations that count.
+    """Declaration of scene parameters (slots) in a file, and of the frames and combinations that count.
 
     Attributes
     ----------
@@ -222,7 +222,7 @@ class Specification:
     def matrix(
         self, chosen: ChosenFrames
     ) -> tuple[list[tuple[str, str]], NDArray[np.int64], Bools]:
-        """Return pairs of values of scene parameters (slots), with their frames and a mask of required pairs.
+        """Return the values of all slots, frame counts for pairs of values, and a mask of required pairs.
 
         Returns
         -------
@@ -263,7 +263,7 @@ class Specification:
 
     @staticmethod
     def read(path: str | Path) -> list[Specification]:
-        """Return the specifications of scene parameters (slots) in a TOML file.
+        """Read the declarations of scene parameters (slots) from a TOML file.
 
         Parameters
         ----------
@@ -358,7 +358,7 @@ def _slot(path: Path, given: Any) -> Slot:
 
 
 class _Held:
-    """Cache of the masks of the selected frames that match a pattern."""
+    """Cache of masks: pattern → mask of the selected frames that match it."""
 
     def __init__(self, chosen: ChosenFrames, tables: Mapping[str, Path]) -> None:
         self._chosen = chosen = chosen.joined(tables)
@@ -376,7 +376,7 @@ class _Held:
         return self._known[pattern]
 
     def values(self, specification: Specification) -> dict[tuple[str, str], Bits]:
-        """Return the frames with each value of each scene parameter (slot), as bit masks."""
+        """For each value of each scene parameter (slot), return the frames with this value, as a bit mask."""
         counts = self.of(specification.where)
         held: dict[tuple[str, str], Bits] = {}
         for slot in specification.slots:
@@ -389,7 +389,7 @@ class _Held:
         return held
 
     def sets(self, specification: Specification) -> tuple[Ints, list[str], Ints]:
-        """Return the frames that count, names of value combinations, and the combination of each frame."""
+        """Return the counted frames, the names of combinations of slot values, and each frame's combination."""
         rows = np.flatnonzero(self.of(specification.where))
         names, code = [""], np.zeros(len(rows), np.int64)
         for slot in specification.slots:
@@ -435,7 +435,7 @@ def slot_sets(chosen: ChosenFrames, specification: Specification) -> tuple[Ints,
 def _combined(
     specification: Specification, k: int, held: _Held
 ) -> Iterator[tuple[tuple[Slot, ...], tuple[str, ...], int]]:
-    """Yield each possible value combination of k slots (scene parameters), with its number of frames.
+    """Yield each possible combination of values of k slots (scene parameters), with its frame count.
 
     Raises
     ------
@@ -466,7 +466,7 @@ def _combined(
 def slot_coverage(
     chosen: ChosenFrames, specifications: Sequence[Specification], k: int = 0
 ) -> tuple[ReportTable, ReportTable, ReportTable]:
-    """Return tables of the value combinations of slots: existing ones and missing ones.
+    """Return tables of the combinations of slot values: existing ones and missing ones.
 
     Parameters
     ----------

@@ -92,7 +92,7 @@ def lock_of(
 def _cases(
     parts: Sequence[CasePart], known: Mapping[int, StoredTrace]
 ) -> tuple[Iterator[_Fields], list[Ints]]:
-    """Return the fields of test cases without digests, and their frame ids, by trace and first frame."""
+    """Return test cases without digests, and the frame ids of each; sorted by trace and first frame."""
     if not parts:
         return iter(()), []
     ends = np.cumsum([len(frame_id) for frame_id, _, _ in parts])
@@ -145,13 +145,13 @@ def _lock_of_bundles(
 def lock_in(
     store: Store, parts: Sequence[tuple[list[int], list[int], str]], *, payloads: bool
 ) -> str:
-    """Return the text of a lock (list of test cases) of some clips in one bundle of a collection."""
+    """Return the text of a lock (list of test cases) for some clips in one bundle of a collection."""
     own = [(np.array(ids, np.int64), np.array(times, np.int64), of) for ids, times, of in parts]
     return lock_of(store, own, {}, payloads=payloads).text()
 
 
 def payload_digests(store: Store, groups: Sequence[Ints]) -> Iterator[Payload]:
-    """Yield the digests of the sensor messages in groups of frames, by channel.
+    """For groups of frames, yield the digests of their sensor messages, by channel.
 
     The digest of a channel covers its messages in the order of their log times, each once,
     independent of other messages between them.
@@ -195,7 +195,7 @@ def recording_of(store: Store, trace_id: int) -> Path:
 
 
 def _digests(store: Store, path: Path, groups: Sequence[Ints]) -> Iterator[Payload]:
-    """Yield the digests of the sensor messages in groups of frames of one recording."""
+    """For groups of frames of one recording, yield the digests of their sensor messages."""
     found = MessagePlaces.of(store.file, np.unique(np.concatenate(groups)))
     places = list(
         zip(found.chunk_offset.tolist(), found.offset.tolist(), found.length.tolist(), strict=True)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 def cases_of(lock: str | Path | Lock, store: Store) -> list[tuple[str, int, int, str]]:
-    """Return the clips of a lock in a store: trace name, first and last log time (ns), and id of the case.
+    """Return the clips of a lock: trace name in the store, first and last log time (ns), and case id.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def cases_of(lock: str | Path | Lock, store: Store) -> list[tuple[str, int, int,
 
 
 def _same(trace: LockedTrace, store: Store) -> StoredTrace:
-    """Return the stored trace of a lock entry. A missing trace, or other settings or map, raises an error."""
+    """Return the stored trace of a lock entry. If it is missing, or was read differently, raise an error."""
     trace_id = Identity.id_of(trace.recording, trace.ego)
     found = next((one for one in store.info() if one.trace_id == trace_id), None)
     if found is None:
@@ -84,7 +84,7 @@ def _not_there(trace: LockedTrace, place: str | Path) -> StoreError:
 def rows_of(
     cases: Sequence[LockedCase], trace_ids: Sequence[int], frame_id: Ints
 ) -> tuple[Ints, Ints]:
-    """Return the row range of each test case in ascending frame ids: first row, and row after the last."""
+    """For each test case, return its range in an array of ascending frame ids: first index, end index."""
     of = np.array(trace_ids, np.int64)
     first = frame_ids(of, np.array([case.first for case in cases], np.int64))
     last = frame_ids(of, np.array([case.last for case in cases], np.int64))
@@ -116,14 +116,14 @@ def frames_of_lock(lock: Lock, store: Store | Collection) -> Ints:
 
 
 def frames_in(store: Store, lock: str) -> list[int]:
-    """Return the ids of the frames of a lock's test cases in one bundle of a collection, ascending."""
+    """For one bundle of a collection, return the frame ids of a lock's test cases, ascending."""
     return frames_of_lock(lock_from(lock), store).tolist()
 
 
 def by_bundle(
     lock: Lock, whole: Collection, *, by_name: bool = False
 ) -> tuple[dict[str, Lock], list[LockedTrace]]:
-    """Return the parts of a lock for each bundle (store) of a collection, and the traces in no bundle."""
+    """Split a lock into one part for each bundle (store) of a collection. Also return traces in no bundle."""
     names = {row["name"]: row["bundle"] for row in whole.traces()} if by_name else {}
     home: dict[str, str] = {}
     for one in lock.traces:

@@ -60,7 +60,7 @@ def minus(a: Lock, b: Lock) -> Lock:
 
 
 def meets(a: Lock, b: Lock) -> Callable[[LockedCase], bool]:
-    """Return a function: True for a test case of lock ``a`` that shares a frame with a case of lock ``b``."""
+    """Return a function that is true for a case of lock ``a`` if a case of lock ``b`` has a common frame."""
     sources = _sources(a)
     firsts: dict[Source, list[int]] = {}
     ends: dict[Source, list[int]] = {}
@@ -112,7 +112,7 @@ def _check(a: Lock, b: Lock) -> None:
 
 
 def _made(how: str, a: Lock, b: Lock, ours: list[LockedCase], theirs: list[LockedCase]) -> Lock:
-    """Return a new lock with test cases of two locks. Traces of the second lock may be renamed."""
+    """Return a new lock with test cases of two locks. Equal names of different traces are made unique."""
     traces = {(trace.recording, trace.ego): trace for trace in a.traces}
     taken = {trace.name for trace in a.traces}
     names: dict[str, str] = {}

@@ -148,7 +148,7 @@ class Lock:
 
     @property
     def ordered(self) -> tuple[LockedCase, ...]:
-        """Return the test cases in their recorded order; cases without an order follow by trace and frame."""
+        """Return the test cases in their recorded order. Other cases follow, by trace and frame."""
         order = self.selection.get("order")
         names = [str(name) for name in order] if isinstance(order, list) else []
         places = {name: place for place, name in enumerate(names)}

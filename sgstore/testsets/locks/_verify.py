@@ -87,7 +87,7 @@ def verify(lock: Lock, store: Store | Collection, *, payloads: bool = True) -> I
 def _by_trace(
     lock: Lock, store: Store, *, payloads: bool
 ) -> Iterator[tuple[LockedTrace, Iterator[Difference]]]:
-    """Yield each trace of a lock, with the differences of the trace and of its test cases."""
+    """Yield each trace of a lock, with its own differences and those of its test cases."""
     with store.file.snapshot():
         known = {one.name: one for one in store.info()}
         known |= {one.trace_id: one for one in known.values()}
@@ -122,7 +122,7 @@ def _of_bundles(lock: Lock, whole: Collection, *, payloads: bool) -> Iterator[Di
 
 
 def differences_in(store: Store, lock: str, *, payloads: bool) -> dict[str, list[Any]]:
-    """Return the differences between part of a lock file and one bundle of a collection, by trace."""
+    """Compare a part of a lock with one bundle of a collection. Return the differences: trace → list."""
     return {
         trace.name: [astuple(one) for one in differences]
         for trace, differences in _by_trace(lock_from(lock), store, payloads=payloads)
@@ -155,7 +155,7 @@ def verify_case(
 
 
 def _found(trace: LockedTrace, known: Mapping[int | str, StoredTrace]) -> StoredTrace | None:
-    """Return the stored trace that belongs to a trace of a lock, found by id or by name; or None."""
+    """Find the stored trace for a trace of a lock, by id or else by name; ``None`` if it is missing."""
     return known.get(Identity.id_of(trace.recording, trace.ego)) or known.get(trace.name)
 
 
@@ -226,7 +226,7 @@ def _cases(
 def _frames(
     cases: Sequence[LockedCase], trace_ids: Sequence[int], store: Store
 ) -> tuple[Ints, Ints]:
-    """Return the ids and log times of the frames from the first to the last test case, ascending."""
+    """Return ids and log times of all frames from the first to the last frame of the test cases."""
     of = np.array(trace_ids, np.int64)
     first = int(frame_ids(of, np.array([case.first for case in cases])).min())
     last = int(frame_ids(of, np.array([case.last for case in cases])).max())

@@ -80,7 +80,7 @@ def fault_detection(failed: Bools, seed: int = 0) -> FaultDetection:
 
 
 def failure_curve(failed: Bools, points: int = 200) -> list[tuple[int, int, float, float]]:
-    """Return points of a curve: number of failures in the first n test cases of an order.
+    """Return points of a curve: how many failures the first n test cases of an order have.
 
     Parameters
     ----------
@@ -105,5 +105,5 @@ def failure_curve(failed: Bools, points: int = 200) -> list[tuple[int, int, floa
 
 
 def _drawn(left: Floats, rng: np.random.Generator) -> float:
-    """Return one bootstrap sample of the APFD: the mean of randomly drawn failures."""
+    """Draw failures at random with repetition, and return their mean: a bootstrap sample of the APFD."""
     return float(left[rng.integers(0, len(left), len(left))].mean())

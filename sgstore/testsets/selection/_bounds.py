@@ -39,7 +39,7 @@ _MEMBERSHIPS: Final = 200_000_000
 
 
 def bounded(family: SetFamily, cover: Ints) -> tuple[float, Ints, Floats]:
-    """Return a lower bound for the cost of a set cover, an equal or cheaper cover, and element prices.
+    """Return a lower bound for the cost of any set cover, a cover no more costly than ``cover``, and prices.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def bounded(family: SetFamily, cover: Ints) -> tuple[float, Ints, Floats]:
 
 
 def _suggested(family: SetFamily, left: Floats) -> Ints:
-    """Return a set cover from the sets whose cost is low compared with the prices of their elements."""
+    """Return a set cover. It prefers sets whose cost is low compared with the prices of their elements."""
     order = np.lexsort((family.rank, left / np.maximum(np.diff(family.starts), 1)))
     place = np.empty(len(order), np.int64)
     place[order] = np.arange(len(order))
@@ -123,7 +123,7 @@ def has_solver() -> bool:
 
 
 def improved(family: SetFamily, cover: Ints, nodes: int) -> tuple[Ints, float, int]:
-    """Return a set cover improved by the integer solver, a lower bound for the cost, and the solver steps.
+    """Improve a set cover by the integer solver. Return it, a lower bound for the cost, and the steps.
 
     Parameters
     ----------
@@ -199,7 +199,7 @@ def _wait(solver: Any) -> None:
 
 
 def _programme(family: SetFamily) -> Any:
-    """Return a set cover as an integer programme: one 0/1 variable per set, one constraint per element."""
+    """Express set cover as an integer programme: a 0/1 variable per set, a constraint per element."""
     import highspy  # pyright: ignore[reportMissingImports, reportMissingTypeStubs]
 
     sets, elements = len(family), len(family.need)

@@ -54,7 +54,7 @@ ROUNDING = 1 + 1e-12
 
 @dataclass
 class BudgetTracker:
-    """Remaining budget of a selection (time, bytes or frames), and the frames that are already paid.
+    """Remaining budget of a selection, and the frames that are already paid.
 
     Attributes
     ----------
@@ -77,14 +77,14 @@ class BudgetTracker:
 
     @classmethod
     def of(cls, units: Units, measure: Measure, most: float = np.inf) -> BudgetTracker:
-        """Return a tracker whose budget is not used yet."""
+        """Return a tracker with the whole budget left."""
         shared = units.overlap and measure != "units"
         weights = units.weights(measure) if shared else None
         nothing = np.zeros(len(units.frame_id), np.bool_)
         return cls(units, units.costs(measure), weights, nothing, 0.0, most * ROUNDING)
 
     def prices(self, some: Ints) -> Floats:
-        """Return the price of selection units: the cost of their frames that are not paid yet."""
+        """Return the price of each given selection unit: the cost of its frames that are not paid yet."""
         if self.weights is None:
             return self.cost[some]
         begin, end = self.units.begin[some].tolist(), self.units.end[some].tolist()
@@ -98,7 +98,7 @@ class BudgetTracker:
         self.left -= price
 
     def fitting(self, order: Ints, most: float = np.inf) -> Ints:
-        """Return the selection units that fit into the budget, in the given order, and pay for them.
+        """Select units in the given order while they fit into the budget. Pay for them, and return them.
 
         Units without new frames are skipped.
         """
@@ -346,7 +346,7 @@ _COARSER: Final = ("EL", "ER", "E")
 
 
 def _saves_nothing(spec: SelectionSpec, units: Units) -> str:
-    """Return a note that a minimal selection needs every unit, with a setting that would need fewer."""
+    """Return a note: the minimal selection needs every unit. The note names a setting that needs fewer."""
     said = f"--minimal saves nothing: each of the {len(units)} {spec.unit}s has an item of its own"
     if spec.sequences:
         return said
@@ -374,7 +374,7 @@ def _selected(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
 
 
 def holdings_of(spec: SelectionSpec, units: Units) -> Holdings:
-    """Return the scene classes, feature combinations or manoeuvre sequences in each frame, clip or trace."""
+    """For each unit, return its scene classes, feature combinations or manoeuvre sequences."""
     if spec.sequences:
         return sequence_holdings(units, spec.sequences, spec.manoeuvres, spec.within_s)
     return holdings(units, spec.abstraction, spec.combos, of_ego=spec.of_ego)
@@ -456,7 +456,7 @@ def _said_of(held: Holdings, units: Units, spec: SelectionSpec) -> dict[str, Any
 
 
 def _met(held: Holdings, units: Units, picked: Ints) -> int:
-    """Return the number of scene classes (or combinations) in the selected clips."""
+    """Return how many scene classes (or combinations) the selected clips contain."""
     taken = np.zeros(len(units), np.bool_)
     taken[picked] = True
     return int(held.weight[np.unique(held.pairs[1][taken[held.pairs[0]]])].sum())
@@ -471,7 +471,7 @@ def _above(cost: float, bound: float) -> str:
 
 
 def _rarest(spec: SelectionSpec, units: Units, rank: Ints, held: Holdings) -> Selection:
-    """Select clips for the rarest scene class first. Prefer clips with many other missing classes."""
+    """Cover the rarest scene class first, each time with the clip that adds most other uncovered classes."""
     measure = spec.budget.measure if spec.budget else spec.objective
     tracker = BudgetTracker.of(units, measure, spec.budget.most if spec.budget else np.inf)
     family = held.family(units, tracker.cost, 1, rank)
@@ -530,7 +530,7 @@ def _stratified(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
 def _allotted(
     order: Ints, stratum: Ints, tracker: BudgetTracker, shares: Floats, rank: Ints
 ) -> Ints:
-    """Select clips of each group up to its share of the budget, then random clips for the rest."""
+    """Select clips of each group up to its share of the budget, then at most one more clip per group."""
     within_share: list[Ints] = []
     used = np.zeros(len(shares))
     for number, share in enumerate(shares.tolist()):
@@ -568,7 +568,7 @@ def _weakest(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
 
 
 def _strata(spec: SelectionSpec, units: Units) -> tuple[Ints, list[str]]:
-    """Return the group (stratum) of each clip: the most frequent value of its frames. Also return group names.
+    """Return the group (stratum) of each clip: the most frequent value of its frames.
 
     Also return the names of all groups.
     """
@@ -593,7 +593,7 @@ def _strata(spec: SelectionSpec, units: Units) -> tuple[Ints, list[str]]:
 
 
 def _value(value: Any) -> str:
-    """Return the name of the group of clips (stratum) that have a value."""
+    """Convert a value to a group name, such as ``true`` or ``unknown``. Clips of a group have this value."""
     if value is None:
         return "unknown"
     if isinstance(value, bool):

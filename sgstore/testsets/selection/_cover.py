@@ -48,7 +48,7 @@ _TABLE: Final = 1 << 26
 
 
 def reduced(family: SetFamily) -> tuple[Ints, list[tuple[SetFamily, Ints]]]:
-    """Return the sets that every cover needs, and the remaining problem in independent parts."""
+    """Return the sets that every cover needs, and the remaining problem divided into independent parts."""
     need, alive = family.need.copy(), np.ones(len(family), np.bool_)
     forced = np.zeros(len(family), np.bool_)
     wanted = need > 0
@@ -70,14 +70,14 @@ def reduced(family: SetFamily) -> tuple[Ints, list[tuple[SetFamily, Ints]]]:
 
 
 def cheapest_alike(family: SetFamily) -> Bools:
-    """Return a mask (S,) of the cheapest set among sets with equal elements."""
+    """Return a mask of sets, (S,): only the cheapest of the sets with the same elements is kept."""
     alive = np.ones(len(family), np.bool_)
     _drop_same_sets(family, alive, np.ones(len(family.need), np.bool_))
     return alive & (np.diff(family.starts) > 0)
 
 
 def _force(family: SetFamily, need: Ints, alive: Bools, forced: Bools) -> None:
-    """Select all sets that are needed because an element occurs in no other sets."""
+    """If an element needs all sets that contain it, select these sets."""
     while True:
         rows = alive[family.set_of]
         often = np.bincount(family.members[rows], minlength=len(need))
@@ -92,7 +92,7 @@ def _force(family: SetFamily, need: Ints, alive: Bools, forced: Bools) -> None:
 
 
 def _drop_same_elements(family: SetFamily, need: Ints, alive: Bools, wanted: Bools) -> None:
-    """Of several elements in exactly the same sets, keep only the one that needs the most sets."""
+    """If several elements are in exactly the same sets, keep only the one with the greatest need."""
     rows = alive[family.set_of] & wanted[family.members]
     key = _keys(family.members[rows], family.set_of[rows], len(need), len(family))
     elements = np.flatnonzero(wanted)
@@ -101,7 +101,7 @@ def _drop_same_elements(family: SetFamily, need: Ints, alive: Bools, wanted: Boo
 
 
 def _drop_same_sets(family: SetFamily, alive: Bools, wanted: Bools) -> None:
-    """Of several sets with the same elements, keep only the cheapest."""
+    """If several sets have the same elements, keep only the cheapest."""
     rows = alive[family.set_of] & wanted[family.members]
     key = _keys(family.set_of[rows], family.members[rows], len(family), len(wanted))
     sets = np.flatnonzero(alive)
@@ -110,7 +110,7 @@ def _drop_same_sets(family: SetFamily, alive: Bools, wanted: Bools) -> None:
 
 
 def _keys(of: Ints, what: Ints, size: int, things: int) -> tuple[Ints, Ints]:
-    """Return a 106-bit hash of the members of each set, as two numbers. Equal sets have equal hashes."""
+    """Return a 106-bit hash of the elements of each set, as two numbers. Equal sets have equal hashes."""
     words = np.random.Generator(np.random.PCG64(20_24)).integers(1 << 31, size=(2, 2, things))
     found: list[Ints] = []
     for low, high in words:
@@ -130,7 +130,7 @@ def _repeated(*keys: Ints) -> Bools:
 def _drop_larger_elements(
     family: SetFamily, need: Ints, alive: Bools, wanted: Bools, most: int
 ) -> int:
-    """Remove elements that are covered whenever another element is covered. Return the number of steps."""
+    """Remove an element if each cover of another element also covers it. Return the number of steps."""
     rows = alive[family.set_of] & wanted[family.members]
 
     def superfluous(small: Ints, large: Ints) -> Ints:
@@ -144,7 +144,7 @@ def _drop_larger_elements(
 
 
 def _drop_smaller_sets(family: SetFamily, alive: Bools, wanted: Bools, most: int) -> int:
-    """Remove sets that are contained in another set of equal or lower cost. Return the number of steps."""
+    """Remove a set if a set that costs no more contains it. Return the number of steps."""
     rows = alive[family.set_of] & wanted[family.members]
 
     def superfluous(small: Ints, large: Ints) -> Ints:
@@ -165,7 +165,7 @@ def _contained(
     superfluous: Callable[[Ints, Ints], Ints],
     most: int,
 ) -> tuple[Bools, int]:
-    """Return a mask of the sets or elements that inclusion tests show as redundant, and the number of steps.
+    """Test which items contain others. Return a mask of redundant items, and the number of steps.
 
     Parameters
     ----------
@@ -209,7 +209,7 @@ def _contained(
 def _compared(
     one: Ints, other: Ints, sizes: tuple[int, int], done: Bools, batch: int
 ) -> tuple[Ints, tuple[Ints, Ints]]:
-    """Return the next sets for an inclusion test, smallest first, with the sets that may contain them.
+    """Return the next items to compare, smallest first, and the items that may contain them.
 
     A containing item has all components of the item, also its first, which is the rarest.
     """
@@ -232,7 +232,7 @@ def _compared(
 def _holding(
     key: Ints, sizes: tuple[int, int], pairs: tuple[Ints, Ints], most: int
 ) -> tuple[Ints, Ints, int]:
-    """Return the pairs of sets in which the second set contains the first, and the number of steps.
+    """Return the pairs in which the second item contains the first, and the number of steps.
 
     All pairs share the first component. Pairs that are undecided within the limit are excluded.
     """
@@ -263,7 +263,7 @@ def _holding(
 def _parts(
     family: SetFamily, need: Ints, alive: Bools, wanted: Bools
 ) -> list[tuple[SetFamily, Ints]]:
-    """Divide the remaining sets into independent problems, which have no elements in common."""
+    """Divide the remaining sets into independent problems. Two problems have no common elements."""
     rows = alive[family.set_of] & wanted[family.members]
     sets, members = family.set_of[rows], family.members[rows]
     group = _joined(sets, members, len(family), len(need))[sets]
@@ -285,7 +285,7 @@ def _parts(
 
 
 def _joined(sets: Ints, members: Ints, many: int, elements: int) -> Ints:
-    """Return the component of each set, (many,). Sets with common elements are in one component."""
+    """Number the groups of connected sets. Sets with common elements are connected."""
     first = np.arange(many)
     while True:
         # Propagate the least set number through elements and sets.
@@ -364,7 +364,7 @@ def minimal(family: SetFamily, nodes: int = NODES) -> Cover:
 
 @dataclass(frozen=True)
 class Fitted:
-    """Sets selected within a budget, and how much of the elements they cover.
+    """Sets selected within a budget, and the weight of the elements that they cover.
 
     Attributes
     ----------
@@ -384,7 +384,7 @@ class Fitted:
 
 
 def within(family: SetFamily, budget: float) -> Fitted:
-    """Return sets within a budget that cover many elements: a greedy choice, or the best single set.
+    """Select sets within a budget that cover many elements: a greedy choice, or the best single set.
 
     The bound is that of submodular functions: for any current choice, the optimum meets at most its
     needs plus the largest gains of single sets that fit the budget together, the last one in part.
@@ -420,7 +420,7 @@ def _at_most(family: SetFamily, chosen: Ints, budget: float) -> float:
 
 @dataclass(frozen=True)
 class UnitPieces:
-    """Clips as ranges of small pieces. Overlapping clips share pieces, and a shared piece is paid only once.
+    """Clips as ranges of pieces. Overlapping clips share pieces. The cost of a shared piece counts once.
 
     Attributes
     ----------
@@ -435,7 +435,7 @@ class UnitPieces:
     cost: Floats
 
     def left(self, one: int, taken: Bools) -> float:
-        """Return the cost of the pieces of a clip that are not selected yet."""
+        """For a clip, return the cost of its pieces that are not selected yet."""
         own = slice(int(self.begin[one]), int(self.end[one]))
         return float(self.cost[own][~taken[own]].sum())
 
@@ -453,7 +453,7 @@ class UnitPieces:
 
 
 def pieces(units: Units, measure: Measure) -> tuple[Units, UnitPieces]:
-    """Cut clips at each start and end of a clip. Return the pieces, and each clip as a range of pieces."""
+    """Cut all clips where any clip starts or ends. Return the pieces, and the range of pieces of each clip."""
     cuts = np.unique(np.concatenate([units.begin, units.end]))
     parts = replace(units, begin=cuts[:-1], end=cuts[1:])
     cost = parts.summed(units.weights(measure), measure)
@@ -492,11 +492,11 @@ def affordable(units: Units, held: Holdings, measure: Measure, rank: Ints, budge
 
 
 def _greedy(family: SetFamily, spans: UnitPieces, budget: float = math.inf) -> Ints:
-    """Select clips one after another, each time the one with the most new elements per additional cost."""
+    """Select clips one by one, each time the clip with the most new elements per additional cost."""
     taken = np.zeros(len(spans.cost), np.bool_)
 
     def cheapened(one: int) -> Iterator[tuple[int, float]]:
-        """Yield the clips that overlap with a selected clip, each with its new, lower price."""
+        """Mark a clip as selected. Yield the clips that overlap with it, each with its lower price."""
         taken[spans.begin[one] : spans.end[one]] = True
         for other in spans.beside(one):
             yield other, max(spans.left(other, taken), 1e-9)

@@ -105,7 +105,7 @@ def curve(selection: Selection, points: int = POINTS) -> Curve:
 
 
 def _of_all_units(selection: Selection) -> Selection:
-    """Return the selection with all units, including units that the bundles of a collection did not return."""
+    """Return the selection with all units. A collection first returns only units that a selection may need."""
     spec, some = selection.spec, selection.units
     units = units_of(some.chosen, spec.unit, spec.clip_s, spec.stride_s)
     picked = np.searchsorted(units.first, some.first[selection.picked])
@@ -119,7 +119,7 @@ def _points(most: int, points: int) -> Ints:
 
 
 def random_need(units: Units, held: Holdings, wanted: int, seed: int) -> tuple[Floats, float]:
-    """Return how many random test cases contain ``wanted`` classes, for several random orders.
+    """For several random orders, return how many test cases are needed to contain ``wanted`` classes.
 
     Returns
     -------

@@ -48,7 +48,7 @@ def model_name() -> str:
 
 
 def features_of(units: Units, rows: Ints) -> Singles:
-    """Return numbers of the ego and its most critical neighbours in one frame of each test case.
+    """For each test case, return numbers about the ego and its most critical neighbours in one frame.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def features_of(units: Units, rows: Ints) -> Singles:
 
 
 def _filled(column: Any) -> Floats:
-    """Return a column with NaN instead of NULL, limited to the range of single precision."""
+    """Return a column with NaN for NULL. Values beyond the range of float32 are limited to this range."""
     most = float(np.finfo(np.float32).max)
     return np.clip(np.ma.filled(np.ma.asarray(column).astype(np.float64), np.nan), -most, most)
 
@@ -101,7 +101,7 @@ def _sql() -> str:
 
 
 def cross_fitted(x: Singles, failed: Bools, known: Bools, seed: int) -> Floats:
-    """Return the failure probability of each test case, (U,). Each model is trained on other test cases.
+    """Return the failure probability of each test case, (U,), from a model trained on other test cases.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ def _check(failed: Bools, known: Bools) -> None:
 
 
 def fitted(x: Singles, failed: Bools, asked: Singles, seed: int) -> Floats:
-    """Train a model on test results, and return the failure probabilities of other test cases, (Q,)."""
+    """Train a model on test results. Return the failure probabilities of Q other test cases, (Q,)."""
     told = ~np.isnan(x).all(axis=0)  # boosting rejects columns without known values
     x, asked = x[:, told], asked[:, told]
     if len(np.unique(failed)) < 2 or not told.any():

@@ -1,4 +1,4 @@
-"""Worst measures of pairs of the ego in each frame, without the measures of all pairs.
+"""Worst measures between the ego and other entities in each frame, without computing all pairs.
 
 Distances and velocities give a lower bound for a measure of a pair. The pair with the least bound of a frame is
 measured first. Then only pairs with a bound up to its value can have a lower value. The values are those of the
@@ -73,7 +73,7 @@ _MARKED: Final = _states(
 def worst_in_frames(
     file: StoreFile, frames: Ints, measures: Sequence[str]
 ) -> tuple[Floats, Ints, Ints]:
-    """Return the least values of measures in each frame, their entities, and the number of pairs without a gap.
+    """For each frame, return the lowest values of measures, their entities, and the number of unknown gaps.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def worst_in_frames(
 
 @dataclass(frozen=True, slots=True)
 class _EgoPairs:
-    """Pairs of the ego and the entities that it could meet, in some frames; shape (K,).
+    """Pairs of the ego and an entity that it could meet, in some frames; arrays of shape (K,).
 
     Attributes
     ----------
@@ -142,7 +142,7 @@ class _EgoPairs:
 
     @classmethod
     def read(cls, file: StoreFile, frames: Ints) -> _EgoPairs:
-        """Read the pairs of ascending frame ids. Only pairs in uneven traces can have marks."""
+        """Read the pairs of frames with ascending ids. Only pairs in uneven traces can have marks."""
         pairs = cls._read(file, frames, _STATES)
         uneven = cls._read(file, frames, _MARKED)
         if len(uneven):
@@ -175,14 +175,14 @@ class _EgoPairs:
         return cls(place[other], node[other], (ego[place[other]], other), columns, marks)
 
     def sided(self, rows: Ints | slice) -> list[Columns]:
-        """Return the columns of the ego and of the other entity of some pairs."""
+        """Return two tables for some pairs: the columns of the ego, and those of the other entity."""
         return [
             {name: values[side[rows]] for name, values in self.columns.items()}
             for side in self.sides
         ]
 
     def numbers(self, rows: Ints | slice) -> PairNumbers:
-        """Return the numbers of some pairs."""
+        """Compute quantities of some pairs, such as closing speed, for the measures."""
         found = PairNumbers.of(*self.sided(rows))
         found |= {name: values[rows] for name, values in self.marks.items()}
         for one in "ab":
@@ -191,7 +191,7 @@ class _EgoPairs:
 
 
 def _bounds(pairs: PairNumbers, measures: Sequence[str]) -> tuple[list[Floats], Bools]:
-    """Return lower bounds of measures, and a mask of the pairs without a known gap."""
+    """Return lower bounds for measures of pairs, and a mask of the pairs whose gap is unknown."""
     apart = np.maximum(pairs["at_least"], 0) * _SLACK
     unknown = np.isnan(apart + pairs["ca"] + pairs["cb"])
     closing = np.nan_to_num(pairs["closing_speed"])
@@ -207,14 +207,14 @@ def _bounds(pairs: PairNumbers, measures: Sequence[str]) -> tuple[list[Floats], 
 
 
 def _least(frame: Ints, values: Floats, count: int) -> Floats:
-    """Return the least value of each frame; inf without one."""
+    """Return the lowest value in each frame; infinite for a frame without values."""
     least = np.full(count, np.inf)
     np.minimum.at(least, frame, values)
     return least
 
 
 def _first(frame: Ints, bound: Floats, count: int) -> Ints:
-    """Return a row with the least bound of each frame."""
+    """For each frame, return one row with the lowest bound. Frames without a finite bound are left out."""
     rows = np.flatnonzero((bound == _least(frame, bound, count)[frame]) & (bound < np.inf))
     first = np.full(count, -1)
     first[frame[rows]] = rows
@@ -222,7 +222,7 @@ def _first(frame: Ints, bound: Floats, count: int) -> Ints:
 
 
 def _values(pairs: _EgoPairs, rows: Ints, measures: Sequence[str]) -> Floats:
-    """Return the measures (M, R) of some pairs; inf for an unknown value."""
+    """Return M measures of R pairs, (M, R); infinite for an unknown value."""
     found = np.full((len(measures), len(rows)), np.inf)
     for start in range(0, len(rows), _TOGETHER):
         numbers = pairs.numbers(rows[start : start + _TOGETHER])

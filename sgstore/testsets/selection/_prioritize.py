@@ -176,7 +176,7 @@ class WorstValues:
     blind: int = 0
 
     def ranks(self) -> Floats:
-        """Return the rank of each test case, (U,): 1 for the worst value. Unknown values are last."""
+        """Return the rank of each test case, (U,). The worst value has rank 1. Unknown values come last."""
         sign = _sign(self.name)
         filled = np.where(np.isnan(self.value), np.inf, sign * self.value)
         _, place, many = np.unique(filled, return_inverse=True, return_counts=True)
@@ -282,7 +282,7 @@ class Prioritized:
             yield from zip(places, names, risk, *columns, said, strict=True)
 
     def reasons(self) -> list[str]:
-        """Return the reason for the place of each test case, in the order of the places."""
+        """For each test case, return the reason for its place, in the order of the places."""
         return [row[-1] for row in self.rows()]
 
     def table(self) -> ReportTable:
@@ -418,21 +418,21 @@ def _lacking(spec: PrioritySpec, units: Units, worst: Sequence[WorstValues]) -> 
 
 
 def _places(total: Floats, rank: Ints) -> Ints:
-    """Return the place of each value in ascending order, (U,), from 0. ``rank`` orders equal values."""
+    """Return the place of each value in ascending order, (U,), from 0. For equal values, ``rank`` decides."""
     found = np.empty(len(total), np.int64)
     found[np.lexsort((rank, total))] = np.arange(len(total))
     return found
 
 
 def _in_rounds(order: Ints, code: Ints) -> Ints:
-    """Return test cases in rounds. Each round has one test case of every class that still has one."""
+    """Order test cases in rounds. A round has one test case of each class with test cases left."""
     turn = _turns(code[order])
     turn[code[order] == UNKNOWN] = len(order) + 1  # without a class: last
     return order[np.argsort(turn, kind="stable")]
 
 
 def _turns(code: Ints) -> Ints:
-    """Return the position of each test case among the test cases of its class, (n,), counted from 1."""
+    """Number the test cases of each class from 1. Return the number of each test case, (n,)."""
     order = np.argsort(code, kind="stable")
     fresh = np.append(True, np.diff(code[order]) != 0)[: len(code)]
     places = np.arange(len(code))
@@ -442,7 +442,7 @@ def _turns(code: Ints) -> Ints:
 
 
 def _together(*orders: Ints) -> Ints:
-    """Merge several orders of the same test cases into one order, by the sum of their places.
+    """Merge several orders of the same test cases. The sum of places in all orders decides.
 
     The first order decides between equal sums.
     """
@@ -462,7 +462,7 @@ def _classes(units: Units, abstraction: str) -> Ints:
 def worst_values(
     units: Units, measures: Sequence[str], told: Situations | None = None
 ) -> tuple[WorstValues, ...]:
-    """Return the worst value of each criticality measure in each test case.
+    """For each criticality measure, return the worst value in each test case.
 
     ``told`` receives the situations of frames, which are cheap in addition to numbers of pairs.
     """
@@ -473,7 +473,7 @@ def worst_values(
 
 
 def _most_critical(units: Units, worst: Sequence[WorstValues]) -> Ints:
-    """Return the index of the most critical frame of each test case, (U,).
+    """For each test case, return the index of its most critical frame, (U,).
 
     The first measure with a known value in the test case decides.
     """
@@ -484,7 +484,7 @@ def _most_critical(units: Units, worst: Sequence[WorstValues]) -> Ints:
 
 
 def _worst_of_encounters(units: Units, measures: Sequence[str]) -> dict[str, WorstValues]:
-    """Return the worst values of measures that an encounter has only once, for all of its frames."""
+    """For measures with one value per encounter, return the worst value in each test case."""
     if not measures:
         return {}
     value, other = (np.full((len(measures), len(units.frame_id)), fill) for fill in (np.inf, -1))
@@ -529,7 +529,7 @@ def _worst_of_pairs(
 
 
 def _worst_within_bounds(units: Units, measures: Sequence[str]) -> tuple[Floats, Ints, int]:
-    """Return signed values, entities and blind pairs as :func:`_worst_of_all_pairs` does."""
+    """Return the same as :func:`_worst_of_all_pairs`, without measures of all pairs."""
     value = np.full((len(measures), len(units.frame_id)), np.inf)
     other = np.full(value.shape, -1)
     blind = 0
@@ -545,7 +545,7 @@ def _worst_within_bounds(units: Units, measures: Sequence[str]) -> tuple[Floats,
 def _worst_of_all_pairs(
     units: Units, measures: Sequence[str], told: Situations | None
 ) -> tuple[Floats, Ints, int]:
-    """Return signed values and entities for each measure and frame, and the number of pairs without a gap."""
+    """For each measure and frame, return the worst value and its entity. Also count pairs with unknown gap."""
     columns = ["frame_id"]
     for i, name in enumerate(measures):
         column = RANKED[name].column or name
@@ -585,7 +585,7 @@ def _worst_of_all_pairs(
 
 
 def _worst_of(units: Units, name: str, frames: Floats, who: Ints) -> WorstValues:
-    """Return the worst value of a measure in each test case, from values of frames (inf means unknown)."""
+    """From the values of a measure in frames (infinite: unknown), return the worst value in each test case."""
     ranges = np.stack([units.begin, units.end], axis=1).ravel()
     least = np.minimum.reduceat(np.append(frames, np.inf), ranges)[::2]
     row = units.begin.copy()
@@ -616,7 +616,7 @@ def _reasons(
     who: Mapping[tuple[int, int], str],
     times: Floats,
 ) -> list[str]:
-    """Return the reason for the place of each test case: its worst value, with time and entity.
+    """For each test case, return the reason for its place: the worst value, with its time and entity.
 
     An unknown value gives an empty text.
     """
@@ -684,7 +684,7 @@ def locked_order(
 
 
 def failed_in_order(order: Prioritized, outcomes: Mapping[str, bool]) -> Bools:
-    """Return the known test results in the order of the test cases. True means a failure.
+    """Return the known test results in the order of the test cases; True for a failure.
 
     Parameters
     ----------
@@ -703,7 +703,7 @@ def failed_in_order(order: Prioritized, outcomes: Mapping[str, bool]) -> Bools:
 
 
 def outcomes_of(units: Units, outcomes: Mapping[str, bool]) -> tuple[Bools, Bools]:
-    """Return two masks (U,) of test cases: those with a failure, and those with a known result.
+    """Return two masks of test cases, (U,): with a failure, and with a known result.
 
     Raises
     ------

@@ -35,7 +35,7 @@ def spread(begin: Ints, end: Ints) -> tuple[Ints, Ints]:
 
 @dataclass(frozen=True)
 class SetFamily:
-    """Family of sets for set covers: elements and cost of each set, and how often each element must be covered.
+    """Sets for a set cover: elements and cost of each set, and how many sets each element needs.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class SetFamily:
         need: int = 1,
         rank: Ints | None = None,
     ) -> SetFamily:
-        """Return a family of sets from pairs (2, M) of set and element. Duplicates are allowed."""
+        """Make a family of sets from pairs (2, M): set number, element number. Duplicates are allowed."""
         key = distinct(pairs[0].astype(np.int64) * max(elements, 1) + pairs[1])
         of_set, members = np.divmod(key, max(elements, 1))
         starts = np.searchsorted(of_set, np.arange(sets + 1))
@@ -95,7 +95,7 @@ class SetFamily:
 
     @property
     def set_of(self) -> Ints:
-        """Return the index of the set for each entry of the member array, (M,)."""
+        """For each entry of ``members``, return the number of its set, (M,)."""
         return np.repeat(np.arange(len(self)), np.diff(self.starts))
 
     def elements(self, one: int) -> Ints:
@@ -103,19 +103,19 @@ class SetFamily:
         return self.members[self.starts[one] : self.starts[one + 1]]
 
     def by_element(self) -> tuple[Ints, Ints]:
-        """Return the sets that contain each element, as one array, and the start of each element in it."""
+        """For each element, return the sets that contain it: an array of starts, and an array of sets."""
         order = np.argsort(self.members, kind="stable")
         starts = np.searchsorted(self.members[order], np.arange(len(self.need) + 1))
         return starts, self.set_of[order]
 
     def gains(self, open_: Bools) -> Floats:
-        """Return for each set the total weight of its elements that still need to be covered, (S,)."""
+        """For each set, return the total weight of its elements that are still needed, (S,)."""
         rows = open_[self.members]
         weight = self.weight[self.members[rows]].astype(np.float64)
         return np.bincount(self.set_of[rows], weight, len(self)).astype(np.float64)
 
     def covered(self, chosen: Ints) -> Ints:
-        """Return for each element the number of selected sets that contain it, (E,)."""
+        """For each element, return the number of selected sets that contain it, (E,)."""
         taken = np.zeros(len(self), np.bool_)
         taken[chosen] = True
         return np.bincount(self.members[taken[self.set_of]], minlength=len(self.need))
@@ -144,7 +144,7 @@ def greedy(
     budget: float = math.inf,
     cheapened: Callable[[int], Iterable[tuple[int, float]]] | None = None,
 ) -> Ints:
-    """Select sets one after another, each time the set with the most new elements per cost.
+    """Select sets one by one, each time the set with the most new elements per cost.
 
     Parameters
     ----------
@@ -196,7 +196,7 @@ def greedy(
 
 
 def thinned(family: SetFamily, chosen: Ints, order: Ints | None = None) -> Ints:
-    """Return the selected sets without those whose elements the other selected sets cover.
+    """Remove a selected set if the other selected sets cover all its elements. Return the remaining sets.
 
     Parameters
     ----------
@@ -219,7 +219,7 @@ def thinned(family: SetFamily, chosen: Ints, order: Ints | None = None) -> Ints:
 
 
 def ordered(family: SetFamily, chosen: Ints) -> Ints:
-    """Return the selected sets, sorted by new elements per cost. Sets without new elements come last."""
+    """Sort the selected sets by new elements per cost. Sets without new elements come last."""
     chosen = np.sort(chosen)
     wanted = np.ones(len(family.need), np.bool_)
     need = np.minimum(family.need, family.covered(chosen))
@@ -229,12 +229,12 @@ def ordered(family: SetFamily, chosen: Ints) -> Ints:
 
 
 def met(family: SetFamily, chosen: Ints) -> int:
-    """Return the total weight of the element needs that the selected sets cover."""
+    """Return how much of the need of all elements the selected sets meet, as a sum of weights."""
     return int((np.minimum(family.covered(chosen), family.need) * family.weight).sum())
 
 
 def or_alone(family: SetFamily, chosen: Ints, budget: float) -> Ints:
-    """Return the selected sets, or one single set within the budget if it covers more."""
+    """Return the selected sets; or a single set within the budget, if it covers more than they do."""
     gain = family.gains(family.need > 0)
     single = np.flatnonzero(family.cost <= budget)
     best = single[np.lexsort((family.rank[single], -gain[single]))[:1]]

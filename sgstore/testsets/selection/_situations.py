@@ -1,4 +1,4 @@
-"""Situation of the ego in a frame: the first entity that it may collide with, its direction and place."""
+"""Situation of the ego in a frame: the entity that it may collide with first, its direction and place."""
 
 from __future__ import annotations
 
@@ -53,13 +53,13 @@ _SQL: Final = f"""
 
 
 def frames_in_parts(frames: Ints, size: int = _FRAMES) -> Iterator[tuple[int, Ints]]:
-    """Yield groups of ascending frame ids, each with the index of its first frame."""
+    """Divide ascending frame ids into groups. Yield each group with the index of its first frame."""
     for start in range(0, len(frames), size):
         yield start, frames[start : start + size]
 
 
 def situations(units: Units, rows: Ints) -> tuple[Ints, list[str]]:
-    """Return the situation of the ego in one frame of each test case, (U,), as an index into a list.
+    """For one frame of each test case, return the ego's situation as an index, (U,), and the names.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def situations(units: Units, rows: Ints) -> tuple[Ints, list[str]]:
 
 
 class Situations:
-    """Situations of the ego (possible conflicts) by frame; frames without other entities have none."""
+    """Situation of the ego (possible conflict) in each frame. A frame without other entities has none."""
 
     def __init__(self, count: int, kinds: Sequence[str]) -> None:
         self._code = np.full(count, _NOBODY, np.int64)
@@ -96,7 +96,7 @@ class Situations:
         self._code[rows] = codes
 
     def of(self, rows: Ints) -> tuple[Ints, list[str]]:
-        """Return the situations of the ego in some frames, as indices into a list of names."""
+        """Return the situations of the ego in some frames, as indices into a list, and the list of names."""
         used, code = np.unique(self._code[rows], return_inverse=True)
         names = list(map(self._name, used.tolist()))
         order = sorted(range(len(names)), key=names.__getitem__)

@@ -62,7 +62,7 @@ def frame_values(units: Units, text: str) -> tuple[Ints, Floats]:
 
 
 def _condition_in(text: str) -> str | None:
-    """Return the condition inside ``robustness(…)``. ``None`` means another expression."""
+    """If an expression is ``robustness(…)``, return the condition inside it; otherwise ``None``."""
     prefix = "MATCH () RETURN "
     try:
         match = parse(prefix + text)[-1]

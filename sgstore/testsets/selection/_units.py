@@ -137,7 +137,7 @@ class Units:
 
     @property
     def total(self) -> int:
-        """Return the number of selection units, including units that bundles (store files) left out."""
+        """Return the number of all units. In a collection, bundles may not have returned all of them."""
         return len(self) + self.others
 
     @property
@@ -184,7 +184,7 @@ class Units:
         return found
 
     def members(self) -> Iterator[tuple[Ints, Ints]]:
-        """Yield groups of pairs: index of a clip or trace, and index of a frame in it."""
+        """Yield pairs in groups: the index of a clip or trace, and the index of one of its frames."""
         ends = np.cumsum(self.sizes)
         low = 0
         while low < len(self):
@@ -195,7 +195,7 @@ class Units:
             low = high
 
     def weights(self, measure: Measure) -> Floats:
-        """Return the cost of each frame, (N,): 1, its duration in seconds, or the bytes of its messages."""
+        """Return the cost of each frame, (N,): 1, or its duration in seconds, or the bytes of its messages."""
         match measure:
             case "units" | "frames":
                 return np.ones(len(self.frame_id))
@@ -210,13 +210,13 @@ class Units:
                 return found
 
     def costs(self, measure: Measure) -> Floats:
-        """Return the cost of each clip or trace by itself, (U,)."""
+        """Return the cost of each clip or trace, (U,). A frame in several clips counts in each."""
         if measure == "units":
             return np.ones(len(self))
         return self.summed(self.weights(measure), measure)
 
     def summed(self, weights: Floats, measure: Measure) -> Floats:
-        """Return the total weight of the frames in each clip or trace, (U,). It is always positive."""
+        """For each clip or trace, return the total weight of its frames, (U,). It is always positive."""
         if not len(self):
             return np.zeros(0)
         ranges = np.stack([self.begin, self.end], axis=1).ravel()
@@ -225,7 +225,7 @@ class Units:
         return np.maximum(found, 1e-3 if measure == "seconds" else 1.0)
 
     def together(self, picked: Ints, measure: Measure) -> float:
-        """Return the total cost of some clips or traces. A shared frame is counted once."""
+        """Return the total cost of some clips or traces. A frame in several clips counts once."""
         if measure == "units":
             return float(len(picked))
         if not self.overlap:
@@ -233,7 +233,7 @@ class Units:
         return float(self.weights(measure)[self.rows_of(picked)].sum())
 
     def ranks(self, seed: int) -> Ints:
-        """Return random ranks of the clips or traces, (U,), equal in all stores with the same traces."""
+        """Return a random rank for each clip or trace, (U,). Stores with the same traces have equal ranks."""
         mixed = _mixed(self.first.astype(np.uint64) + np.uint64(seed * int(_STEP) % (1 << 64)))
         order = np.lexsort((self.first, mixed))
         rank = np.empty(len(order), np.int64)
@@ -313,7 +313,7 @@ def _ranges(fresh: Bools) -> tuple[Ints, Ints]:
 
 
 def _clips(frames: Units, time_ns: Ints, clip_s: float, stride_s: float) -> tuple[Ints, Ints]:
-    """Return the index of the first frame of each clip, and the index after its last frame."""
+    """Return two indices for each clip: its first frame, and the frame after its last one."""
     period = periods_of(frames.chosen.store, frames.frame_id)
     fresh = run_begins(frames.chosen.store, frames.frame_id, time_ns)
     starts, ends = _ranges(fresh)
@@ -335,7 +335,7 @@ def _clips(frames: Units, time_ns: Ints, clip_s: float, stride_s: float) -> tupl
 
 @dataclass(frozen=True)
 class Holdings:
-    """Scene classes, feature combinations or sequences (the elements) that each selection unit contains.
+    """Elements of each selection unit: scene classes, feature combinations or sequences.
 
     Attributes
     ----------
@@ -367,12 +367,12 @@ class Holdings:
         return int(self.weight.sum())
 
     def family(self, units: Units, cost: Floats, need: int, rank: Ints) -> SetFamily:
-        """Return a family of sets: each clip or trace is the set of the scene classes that it contains."""
+        """Return a set family for set covers: each clip or trace is the set of its scene classes."""
         found = SetFamily.of(self.pairs, len(units), len(self.frames), cost, need, rank)
         return replace(found, weight=self.weight)
 
     def over(self, units: Units) -> Holdings:
-        """Return the same elements for other clips of the same frames.
+        """Return the elements of other clips with the same frames.
 
         Raises
         ------
@@ -389,7 +389,7 @@ class Holdings:
 
 
 def holdings(units: Units, abstraction: str, combos: int = 0, *, of_ego: bool = False) -> Holdings:
-    """Return the scene classes, or the combinations of k features, in each clip or trace.
+    """For each clip or trace, return its scene classes, or its combinations of k features.
 
     Parameters
     ----------
@@ -419,12 +419,12 @@ def holdings(units: Units, abstraction: str, combos: int = 0, *, of_ego: bool = 
 
 
 def kind_of(abstraction: str) -> str:
-    """Return the name of the counted elements for a message, such as classes in an abstraction."""
+    """Return a name for the scene classes of an abstraction, for messages."""
     return f"classes in {abstraction}"
 
 
 def sequence_holdings(units: Units, k: int, names: Sequence[str], within_s: float) -> Holdings:
-    """Return the sequences of k manoeuvres in each clip or trace.
+    """For each clip or trace, return the sequences of k manoeuvres in it.
 
     Parameters
     ----------
@@ -461,7 +461,7 @@ def sequence_holdings(units: Units, k: int, names: Sequence[str], within_s: floa
 
 
 def classes_of(units: Units, of: Classed) -> Ints:
-    """Return pairs (2, M) of a clip or trace and a scene class that it contains."""
+    """Return pairs (2, M): a clip or trace, and a scene class in it."""
     present = of.present()
     number = np.full(len(of.names) + 1, UNKNOWN)
     number[present] = np.arange(len(present))
@@ -479,7 +479,7 @@ def classes_of(units: Units, of: Classed) -> Ints:
 
 
 def _distinct_combinations(found: Combinations) -> tuple[Bools, Ints, Ints]:
-    """Return the feature combinations of the scene classes. Combinations with the same frames are merged.
+    """Return which scene classes have each feature combination. Combinations in the same frames are merged.
 
     Also return the multiplicity and the number of frames of each.
     """
@@ -513,7 +513,7 @@ def _distinct_combinations(found: Combinations) -> tuple[Bools, Ints, Ints]:
 
 
 def _of_units(pairs: Ints, has: Bools) -> Ints:
-    """Return pairs of a clip and a feature combination, from pairs of a clip and a scene class."""
+    """Convert pairs (clip, scene class) to pairs (clip, feature combination)."""
     held = 0
     parts: list[Ints] = []
     unit, row = pairs
@@ -541,7 +541,7 @@ def _whole_units(unit: Ints, step: int) -> Iterator[tuple[int, int]]:
 
 
 def kept(pairs: Ints, weight: Ints, picked: Ints, units: int) -> Ints:
-    """Return, for each n, the number of scene classes (or combinations) in the first n selected clips."""
+    """For each n, return the number of scene classes (or combinations) in the first n selected clips."""
     place = np.full(units, -1)
     place[picked] = np.arange(len(picked))
     rows = place[pairs[0]] >= 0
