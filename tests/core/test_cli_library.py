@@ -275,3 +275,25 @@ def test_check_library_checks_each_property(
     assert run(["check", store, "-p", "phi2", "-p", "phi4", "--json"]) == OK
     assert together == json.loads(capsys.readouterr().out)
     assert {one["check"] for one in together} == {"phi2", "phi4"}
+
+
+@pytest.mark.parametrize(
+    ("line", "hint"),
+    [
+        ("check STORE overlaps", "did you mean 'no_collision' or "),
+        ("find STORE overlaps", "did you mean 'collision' or 'no_collision' or 'low_ttc'?"),
+        ("find STORE -p crashes", "did you mean 'collision' or "),
+        ("check STORE no_colision", "did you mean 'no_collision'?"),
+        ("find STORE -p overlaps", "more: sgstore patterns search overlaps"),
+        ("find STORE -p xylophone", "list all names with 'sgstore patterns list'"),
+        ("patterns R157", "write: sgstore patterns search R157"),
+        ("patterns cut_in", "write: sgstore patterns show cut_in"),
+    ],
+)
+def test_unknown_pattern_name_suggests_patterns_with_its_words(
+    store: str, capsys: pytest.CaptureFixture[str], line: str, hint: str
+) -> None:
+    arguments = [store if word == "STORE" else word for word in line.split()]
+
+    assert run(arguments) != OK
+    assert hint in " ".join(capsys.readouterr().err.split())

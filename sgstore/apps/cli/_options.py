@@ -449,7 +449,7 @@ def _command_instead(group: TyperGroup, ctx: Any, args: list[str]) -> str:
     if path and not place:
         from sgstore.lang.library import patterns
 
-        words = ["show", *args] if "show" in group.commands and word in patterns() else []
+        words = ["show" if word in patterns() else "search", *args] if path == "patterns" else []
     elif path == "lock":
         words = ["list", *args] if word.endswith(".lock") else []
         path, words = (path, words) if words else ("", ["select", *args, "-o", "tests.lock"])

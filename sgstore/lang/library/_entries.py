@@ -21,7 +21,6 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from difflib import get_close_matches
 from functools import cache
 from importlib import resources
 from types import MappingProxyType
@@ -30,7 +29,7 @@ from typing import TYPE_CHECKING, Final
 from sgstore.errors import QueryError, QueryNameError
 from sgstore.lang.syntax import parse
 from sgstore.lang.syntax.tree import Define
-from sgstore.model.vocabulary import normalize_name, suggestion
+from sgstore.model.vocabulary import normalize_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -214,29 +213,6 @@ def patterns() -> Mapping[str, NamedPattern]:
                 raise QueryError(f"{library}.sgql: a second '{entry.name}'")
             found[entry.name] = entry
     return MappingProxyType(found)
-
-
-def pattern_named(name: str) -> NamedPattern:
-    """Return a pattern of the query library by name.
-
-    Case and underscores count only if two names differ in nothing else.
-
-    Raises
-    ------
-    QueryNameError
-        The name is unknown or ambiguous.
-    """
-    found = patterns()
-    if name in found:
-        return found[name]
-    like = [known for known in found if normalize_name(known) == normalize_name(name)]
-    if len(like) == 1:
-        return found[like[0]]
-    if like:
-        raise QueryNameError(f"'{name}' may be {' or '.join(like)}", hint="write one of them")
-    near = next(iter(get_close_matches(name, found, 1)), suggestion(name, found))
-    hint = f"did you mean '{near}'?" if near else "list all names with 'sgstore patterns list'"
-    raise QueryNameError(f"unknown pattern '{name}'", hint=hint)
 
 
 @cache

@@ -1,18 +1,26 @@
-"""Search for patterns of the query library by words."""
+"""Search for patterns of the query library by name, or by words."""
 
 from __future__ import annotations
 
 import re
 from collections import Counter
+from difflib import get_close_matches
 from functools import cache
 from math import log
 from typing import TYPE_CHECKING, Final
 
+from sgstore.errors import QueryNameError
 from sgstore.lang.library._entries import NamedPattern, patterns
-from sgstore.model.vocabulary import LABEL_ALIASES
+from sgstore.model.vocabulary import LABEL_ALIASES, normalize_name, suggestion
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
+
+_SUGGESTED: Final = 3
+"""Largest number of patterns that the error about an unknown name suggests."""
+
+_MISSPELT: Final = 0.8
+"""Least similarity of a name to its misspelling, from 0 to 1."""
 
 _WORD: Final = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+")
 
@@ -70,6 +78,49 @@ _PREDICATE: Final = 0.8
 
 _RARE: Final = 0.1
 """Largest share of the entries that have a rare word."""
+
+
+def pattern_named(name: str, *, check: bool = False) -> NamedPattern:
+    """Return a pattern of the query library by name.
+
+    Case and underscores count only if two names differ in nothing else.
+
+    Parameters
+    ----------
+    name : str
+    check : bool
+        True to suggest only checks for an unknown name.
+
+    Raises
+    ------
+    QueryNameError
+        The name is unknown or ambiguous.
+    """
+    found = patterns()
+    if name in found:
+        return found[name]
+    like = [known for known in found if normalize_name(known) == normalize_name(name)]
+    if len(like) == 1:
+        return found[like[0]]
+    if like:
+        raise QueryNameError(f"'{name}' may be {' or '.join(like)}", hint="write one of them")
+    raise QueryNameError(f"unknown pattern '{name}'", hint=_hint_for(name, check=check))
+
+
+def _hint_for(name: str, *, check: bool) -> str:
+    """Return a hint for an unknown name: a misspelt name, otherwise patterns with its words."""
+    names = [one.name for one in patterns().values() if one.is_check or not check]
+    words = [one.name for one in search(name) if one.name in names][:_SUGGESTED]
+    near = get_close_matches(name, names, 1, _MISSPELT)
+    near = near or words or get_close_matches(name, names, 1)
+    near = near or [one for one in (suggestion(name, names),) if one]
+    if not near:
+        return "list all names with 'sgstore patterns list'"
+    more = (
+        f"; more: sgstore patterns search {name}" if len(words) == len(near) == _SUGGESTED else ""
+    )
+    listed = " or ".join(f"'{one}'" for one in near)
+    return f"did you mean {listed}?{more}"
 
 
 def search(text: str, kinds: Collection[str] = ()) -> list[NamedPattern]:

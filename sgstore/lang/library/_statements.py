@@ -6,7 +6,8 @@ import re
 from typing import TYPE_CHECKING, Final
 
 from sgstore.errors import QueryError
-from sgstore.lang.library._entries import pattern_named, patterns
+from sgstore.lang.library._entries import patterns
+from sgstore.lang.library._search import pattern_named
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -46,7 +47,7 @@ def statement(
     if first in _STATEMENTS:
         return text, values
     if (name := _NAME.fullmatch(text)) is not None:
-        found = pattern_named(name[1])
+        found = pattern_named(name[1], check=check)
         if found.kind == "predicate":
             hint = f"write it after WHERE: MATCH … WHERE {found.name}(…)"
             raise QueryError(f"{found.name} is a condition", hint=hint)
