@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shlex
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final
 
@@ -91,7 +92,7 @@ def translated(path: Path) -> Generator[None]:
             raise SqlError(spilled) from error
         if (full := _without_room(message)) is not None:
             raise DiskFullError(f"{path}: {full}") from error
-        raise StoreError(f"{path}: {_reason(message)}") from error
+        raise StoreError(f"{path}: {_reason(message, path)}") from error
 
 
 def _without_room(message: str) -> str | None:
@@ -122,7 +123,7 @@ def os_fault(message: str, error: OSError) -> StoreError:
     return kind(f"{message}: {reason_of(error)}")
 
 
-def _reason(message: str) -> str:
+def _reason(message: str, path: Path) -> str:
     # DuckDB may treat a name that ends in .csv as a table file.
     phrases = (
         "not a valid DuckDB database file",
@@ -130,7 +131,9 @@ def _reason(message: str) -> str:
         "in-memory database in read-only",
     )
     if any(phrase in message for phrase in phrases):
-        return "not a store; expected a file that 'sgstore ingest' made"
+        hint = "not a store; expected a file that 'sgstore ingest' made"
+        doctor = shlex.join(["sgstore", "doctor", str(path)])
+        return hint if path.is_dir() else f"{hint}; for a recording: {doctor}"
     if "database does not exist" in message:
         return "store not found; create it with 'sgstore ingest'"
     if "database file with version number" in message:

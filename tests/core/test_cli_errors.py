@@ -173,3 +173,21 @@ def test_every_verb_reads_files(store: str, tmp_path: Path) -> None:
 
     for verb, name in (("find", "a.sgql"), ("check", "b"), ("sql", "c.sql")):
         assert run([verb, store, str(tmp_path / name)]) == 0
+
+
+def test_recording_instead_of_store_leads_to_doctor(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "a drive.mcap"
+    path.write_bytes(b"\x89MCAP0\r\n")
+
+    assert run(["info", str(path)]) != 0
+    assert f"sgstore doctor '{path}'" in capsys.readouterr().err
+
+
+def test_trace_after_store_leads_to_the_option(
+    town_store: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["info", str(town_store), "town", "a b", "--json"]) != 0
+    written = " ".join(capsys.readouterr().err.split())
+    assert f"write: sgstore info {town_store} --json --trace town --trace 'a b'" in written

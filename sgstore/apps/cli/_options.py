@@ -284,6 +284,13 @@ def _advise(error: Any, verb: Verb, ctx: Any, args: list[str]) -> None:
     stores = [one for one in args if _is_database(one)] if _places(verb) else []
     if len(stores) > 1 and "extra argument" in str(getattr(error, "message", "")):
         error.message = _several_stores(ctx, stores)
+    elif type(error).__name__ == "UsageError" and "--trace" in _words_of(verb):
+        _, extra, _ = verb.make_parser(ctx).parse_args(args=list(args))
+        rest = [one for one in args if one not in extra]
+        named = [word for one in extra for word in ("--trace", one)]
+        if extra:
+            line = shlex.join([*ctx.command_path.split(), *rest, *named])
+            error.message = f"{error.message}; write: {line}"
     if type(error).__name__ == "MissingParameter":
         if error.param.name in _places(verb)[1:]:
             error.message = "Write the store first."
@@ -297,6 +304,11 @@ def _several_stores(ctx: Any, stores: Sequence[str]) -> str:
     each = " --each" if _path_of(ctx) == "sql" else ""
     lines.append(f"{ctx.command_path} fleet{each} …")
     return f"expected one store, found {len(stores)}; make a collection of them: {'; '.join(lines)}"
+
+
+def _words_of(verb: Verb) -> list[str]:
+    """Return the words of all options of a command, sorted."""
+    return sorted({word for one in verb.params for word in (*one.opts, *one.secondary_opts)})
 
 
 def _places(verb: Verb) -> list[str]:
@@ -426,7 +438,7 @@ _OPTIONS_OF_STORE: Final = {"-o", "--to", "--output", "--store", "-s", "--db", "
 
 def _option_instead(verb: Verb, ctx: Any, args: list[str], name: str) -> str:
     """If an option is unknown, return a command line with a similar option; empty if none is similar."""
-    known = sorted({word for one in verb.params for word in (*one.opts, *one.secondary_opts)})
+    known = _words_of(verb)
     others = [new for new, words in _OPTIONS_OF_OTHERS.items() if name in words and new in known]
     if name in _OPTIONS_OF_STORE and name in args[:-1] and _places(verb):
         place = args.index(name)
