@@ -223,3 +223,15 @@ def test_an_edge_without_braces_after_forall_needs_exists(text: str) -> None:
         compile_checks(text, CATALOG)
 
     assert "in braces: EXISTS {(a)-[:near]->(b)}" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [
+        ("ahead", "write the predicate as ahead(a, b); did you mean 'inDFrontOf'?"),
+        ("behind", "write the predicate as behind(a, b); did you mean 'atDRearOf'?"),
+        ("neer", "did you mean 'near'?"),
+    ],
+)
+def test_unknown_relation_names_the_predicate_of_its_name(name: str, hint: str) -> None:
+    assert refused(f"MATCH (e:Ego)-[:{name}]->(v)").hint == hint

@@ -12,12 +12,20 @@ from sgstore.lang.bind._match_values import over_match
 from sgstore.lang.bind._possible import check_edges
 from sgstore.lang.bind._recorded_events import happens
 from sgstore.lang.bind._stages import name_path
-from sgstore.lang.bind._symbols import RESERVED, THE_EGO, Binders, Session, Symbol, SymbolTable
+from sgstore.lang.bind._symbols import (
+    RESERVED,
+    THE_EGO,
+    Binders,
+    Session,
+    Symbol,
+    SymbolTable,
+    call_hint,
+)
 from sgstore.lang.bind._temporal import refuse_window, tense, timespan
 from sgstore.lang.bind._topics import topic_field
 from sgstore.lang.bind._world_scope import whole_block
 from sgstore.lang.catalog import Type
-from sgstore.lang.syntax import said_of
+from sgstore.lang.syntax import hint_at, said_of
 from sgstore.lang.syntax import tree as s
 from sgstore.model.vocabulary import (
     RELATION_ALIASES,
@@ -285,6 +293,8 @@ def _related(label: s.Label, session: Session) -> frozenset[str]:
             )
         known = (*known_names("relation"), *RELATION_ALIASES)
         said = said_of("relations", label.name)
+        if (called := call_hint(label.name)) is not None:
+            said = f"{called}; {said or hint_at(label.name, known)}"
         session.unknown("relation", label.name, label.span, known, said)
     session.relations.add(relation)
     return frozenset({relation})
