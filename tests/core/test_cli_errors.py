@@ -191,3 +191,17 @@ def test_trace_after_store_leads_to_the_option(
     assert run(["info", str(town_store), "town", "a b", "--json"]) != 0
     written = " ".join(capsys.readouterr().err.split())
     assert f"write: sgstore info {town_store} --json --trace town --trace 'a b'" in written
+
+
+@pytest.mark.parametrize("command", ["show", "find", "export", "ingest", "coverage classes"])
+def test_option_that_is_similar_to_no_other_has_no_suggestion(
+    capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    assert run([*command.split(), "x", "--boxes"]) == 2
+    written = capsys.readouterr().err
+    assert written.strip().endswith("No such option: --boxes")
+
+
+def test_misspelt_option_has_a_suggestion(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["show", "x", "--verbos"]) == 2
+    assert "write: sgstore show x --verbose" in capsys.readouterr().err

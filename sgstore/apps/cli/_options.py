@@ -278,9 +278,10 @@ def _looks_like_store(place: str) -> bool:
 def _advise(error: Any, verb: Verb, ctx: Any, args: list[str]) -> None:
     """Add advice to the message of a usage error, such as the right option."""
     name = getattr(error, "option_name", "")
-    if type(error).__name__ == "NoSuchOption" and (line := _option_instead(verb, ctx, args, name)):
+    if type(error).__name__ == "NoSuchOption":
         error.possibilities = None
-        error.message = f"No such option: {name}; write: {line}"
+        if line := _option_instead(verb, ctx, args, name):
+            error.message = f"No such option: {name}; write: {line}"
     stores = [one for one in args if _is_database(one)] if _places(verb) else []
     if len(stores) > 1 and "extra argument" in str(getattr(error, "message", "")):
         error.message = _several_stores(ctx, stores)
@@ -445,7 +446,9 @@ def _option_instead(verb: Verb, ctx: Any, args: list[str], name: str) -> str:
         return shlex.join(
             [*ctx.command_path.split(), args[place + 1], *args[:place], *args[place + 2 :]]
         )
-    new = next(iter([*others, *get_close_matches(name, known, 1)]), "")
+    bare = {word.lstrip("-"): word for word in known}  # dashes would make all options similar
+    close = get_close_matches(name.lstrip("-"), bare, 1)
+    new = next(iter([*others, *(bare[word] for word in close)]), "")
     fixed = [f"{new}{one[len(name) :]}" if one.partition("=")[0] == name else one for one in args]
     return "" if not new or fixed == args else shlex.join([*ctx.command_path.split(), *fixed])
 
