@@ -248,7 +248,7 @@ class StoreVerbs:
         stride : str or float
             Time between the starts of two clips; clips overlap if it is less than --clip.
         abstraction : str
-            Abstraction: E, EL, ER, RSV, …
+            Abstraction: E, EL, ER, RSV, …; 'sgstore docs coverage' has a table of their papers.
         combos : int
             Keep combinations of K features.
         of_ego : bool
@@ -430,7 +430,7 @@ class StoreVerbs:
         unit : {"frame", "run", "trace"}
             Count frames, runs of frames of one class, or traces with it.
         abstraction : str
-            Abstraction: E, EL, ER, RSV, …
+            Abstraction: E, EL, ER, RSV, …; 'sgstore docs coverage' has a table of their papers.
         window : int
             Number of frames that form one class together.
         incomplete : {"equal", "distinct", "drop"}
@@ -504,7 +504,7 @@ class StoreVerbs:
         by_frame : bool
             Count or compare frame by frame.
         abstraction : str
-            Abstraction: E, EL, ER, RSV, …
+            Abstraction: E, EL, ER, RSV, …; 'sgstore docs coverage' has a table of their papers.
         parameters : mapping of str to value
             Value of $NAME in the query; write a list as [1, 2]; repeatable.
 
@@ -660,7 +660,8 @@ class StoreVerbs:
         rebase_context : bool
             mcap: move static messages, such as the map, to the start of each clip.
         abstraction : str
-            nx, pyg, s3c: abstraction of the graphs.
+            nx, pyg, s3c: abstraction of the graphs: E, EL, ER, RSV, …; by default roadscene2vec (pyg),
+            RSV (s3c), or the whole scene graph (nx).
         graphml : bool
             nx: also write each frame as GraphML, for Gephi.
         channels : sequence of str

@@ -378,3 +378,12 @@ def test_a_graph_of_an_abstraction_has_the_names_and_labels_of_the_literature(st
     assert graph.graph["seq"] == 100
     with pytest.raises(AbstractionError, match="there are: E, EL"):
         store.graph("town#100", abstraction="zzz")
+
+
+@pytest.mark.parametrize(
+    ("name", "known"),
+    [("ELR", "RSV"), ("elr", "RSV"), ("S3C", "RSV"), ("rs2v", "roadscene2vec"), ("RVS", "RSV")],
+)
+def test_name_of_a_paper_leads_to_the_abstraction(name: str, known: str) -> None:
+    with pytest.raises(AbstractionError, match=f"did you mean '{known}'"):
+        abstraction_named(name)

@@ -88,6 +88,9 @@ def check_name(name: str) -> None:
 
 _LONGEST: Final = 64
 
+_IN_PAPERS: Final = {"elr": "RSV", "s3c": "RSV", "rs2v": "roadscene2vec"}
+"""Name of an abstraction or a tool in papers → the built-in abstraction."""
+
 
 def abstractions() -> dict[str, Abstraction]:
     """Return all abstractions by name: built-in, registered, and those of other packages."""
@@ -113,6 +116,6 @@ def abstraction_named(name: str) -> Abstraction:
     if found is not None:
         return found
     names = [one.name for one in abstractions().values()]
-    like = suggestion(name, names)
+    like = _IN_PAPERS.get(key) or suggestion(name, names)
     hint = f"did you mean {like!r}?" if like else f"there are: {', '.join(names)}"
     raise AbstractionError(f"no abstraction {name!r}; {hint}")
