@@ -57,7 +57,12 @@ FEATURES: Final = (
     ("up", "m", "above the ego's centre"),
     ("heading", "rad", "less the ego's heading, in (-pi, pi]"),
 )
-"""Columns of ``node_feature`` with name, unit and meaning. NaN if the position or the ego is unknown."""
+"""Columns of ``node_feature`` with name, unit and meaning."""
+
+UNKNOWN: Final = (
+    "NaN: the node has no pose (lanes, roads and signs of the map), or the frame has no ego"
+)
+"""Meaning of a missing value in ``node_feature``."""
 
 _KINDS: Final = {
     "frame_id": ("<i8", 0),
@@ -216,7 +221,8 @@ def _about(export: Export, abstraction: str, columns: _TensorColumns) -> dict[st
         "node_types": columns.types,
         "relations": columns.relations,
         "node_features": [
-            {"name": name, "unit": unit, "meaning": meaning} for name, unit, meaning in FEATURES
+            {"name": name, "unit": unit, "meaning": meaning, "unknown": UNKNOWN}
+            for name, unit, meaning in FEATURES
         ],
         "labels": {
             name: {"text": texts[name], "kind": kind, "words": words}

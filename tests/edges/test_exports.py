@@ -37,7 +37,7 @@ from sgstore.exporters import (
     write_export,
 )
 from sgstore.exporters._clips import clip_name, export_folder, safe_name
-from sgstore.exporters._pyg import ACTORS, RELATIONS
+from sgstore.exporters._pyg import ACTORS, RELATIONS, UNKNOWN
 from sgstore.exporters.graph_data import GraphData
 from sgstore.ingest import ingest
 from sgstore.model.world import Clip
@@ -833,6 +833,18 @@ def test_places_are_as_the_ego_sees_them(export: Export, written: Callable[..., 
             assert np.cos(heading - np.radians(turned)) == pytest.approx(1, abs=1e-6)
             checked += 1
     assert checked > 3
+
+
+def test_unknown_places_are_those_of_the_map(written: Callable[..., Path]) -> None:
+    data = GraphData(written("pyg"))
+    types = np.array(data.about["node_types"])[data.columns["node_type"]]
+    unknown = np.isnan(data.columns["node_feature"])
+
+    assert set(types[unknown.all(axis=1)]) == {"lane", "road", "sign"} & set(types)
+    assert (unknown.all(axis=1) == unknown.any(axis=1)).all()
+    told = {feature["unknown"] for feature in data.about["node_features"]}
+    assert told == {UNKNOWN}
+    assert "lanes, roads and signs" in UNKNOWN
 
 
 def test_labels_to_learn_are_numbers(export: Export, written: Callable[..., Path]) -> None:
