@@ -248,7 +248,8 @@ def draw_clip(  # noqa: PLR0913  as many options as the picture has
         ``….gif``, or with the extra ``video`` ``….mp4`` or ``….webm``; an existing file is
         replaced.
     fps : float
-        Greatest number of pictures per second; of faster frames some are left out.
+        Greatest number of pictures per second. Of faster frames some are left out, if possible
+        those without a match.
     on_frame : function, optional
         Called after each picture with the number of drawn pictures and the total.
     store, matches, camera, relations, radius, north_up, diagram, names
@@ -286,12 +287,13 @@ def draw_clip(  # noqa: PLR0913  as many options as the picture has
             yield from zip(graphs, marked, pictures, strict=True)
 
     with store.file.snapshot():
-        chosen = _chosen(store, frames, fps)
-        trace = chosen[0].trace
+        groups = _groups(store, frames, fps)
+        trace = groups[0][0].trace
         road_map = map_of(store.file, trace)
         usual = camera_of(store.file, trace)
         if camera is None and not usual:
             camera = NO_CAMERA
+    chosen = [_shown(group, matches) for group in groups]
     spread = sorted({len(chosen) * i // SAMPLES for i in range(SAMPLES)} | {len(chosen) - 1})
     samples = [*shots([chosen[number] for number in spread], seen=False)]
     look: dict[str, Any] = {"relations": relations, "radius": radius}
@@ -306,12 +308,12 @@ def draw_clip(  # noqa: PLR0913  as many options as the picture has
     return marked
 
 
-def _chosen(store: Store, frames: FrameRange, fps: float) -> list[FrameRef]:
-    """Return the frames of a clip to draw, at most ``fps`` per second."""
+def _groups(store: Store, frames: FrameRange, fps: float) -> list[list[FrameRef]]:
+    """Return the frames of a clip in groups, at most ``fps`` per second. One frame of a group is drawn."""
     first, last = (store.file.frame(end) for end in frames)
     if last.seq < first.seq:
         raise ExportError(f"the clip from {' to '.join(frames)} ends before it begins")
-    chosen: list[FrameRef] = []
+    groups: list[list[FrameRef]] = []
     due: float | None = None
     sql = (
         "SELECT frame_id, seq, time_ns, log_time_ns, t FROM frames"
@@ -321,9 +323,17 @@ def _chosen(store: Store, frames: FrameRange, fps: float) -> list[FrameRef]:
         frame = replace(first, **about)
         # A small tolerance covers inexact clocks. A clock that runs back starts again.
         if due is None or not due - 2e9 / fps <= frame.time_ns < due:
-            chosen.append(frame)
+            groups.append([])
             due = frame.time_ns + 0.95e9 / fps
-    return chosen
+        groups[-1].append(frame)
+    return groups
+
+
+def _shown(group: Sequence[FrameRef], matches: Bindings | None) -> FrameRef:
+    """Return the first frame of a group in which the query matches, otherwise the first frame."""
+    if matches is None or len(group) == 1:
+        return group[0]
+    return next((frame for frame in group if matches.bindings(frame)), group[0])
 
 
 def map_of(file: StoreFile, trace: str) -> RoadMap | None:

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from sgstore.store import FrameRef
+
 pytestmark = pytest.mark.seconds(17)
 
 RED = (
@@ -495,3 +497,17 @@ def test_the_verb_draws_frames_and_clips(
     assert "end the name in .gif" in capsys.readouterr().err
     assert run(["show", str(store), "town#210", "-o", str(gif), *options]) == 1
     assert ".png or .svg" in capsys.readouterr().err
+
+
+def test_clip_shows_a_match_between_two_drawn_frames(store: Path, tmp_path: Path) -> None:
+    class Matched:
+        """Binding of the ego in one frame, which is not due at 4 pictures per second."""
+
+        def bindings(self, frame: FrameRef) -> list[dict[str, int]]:
+            return [{"e": 0}] if frame.seq == 211 else []
+
+    clip, to = ("town#210", "town#218"), tmp_path / "a.gif"
+    marked = draw_clip(Store(store), clip, to, matches=Matched(), radius=30.0, fps=4.0)
+
+    assert marked == 1
+    assert read(to)[1] == [200, 300, 300]
