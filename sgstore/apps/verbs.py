@@ -437,7 +437,7 @@ def export(  # noqa: PLR0913 - the options of the command
     channels: Sequence[str],
     parameters: Any,
     progress: Callable[[int, int], None] | None = None,
-    on_matches: Callable[[Matches], None] | None = None,
+    on_matches: Callable[[Matches, Sequence[Clip]], None] | None = None,
     **same: Any,
 ) -> list[WrittenClip | WrittenFile]:
     """Export clips; see :meth:`sgstore.query.StoreVerbs.export`."""
@@ -470,9 +470,9 @@ def export(  # noqa: PLR0913 - the options of the command
         clips = around_frames(opened, frames, *margins)
     elif query:
         matches = opened.find(text, **held)
-        if on_matches is not None:
-            on_matches(matches)
         clips = list(matches.clips(*margins))
+        if on_matches is not None:
+            on_matches(matches, clips)
     else:
         clips = _whole_clips(opened, exporter)
     if not clips:

@@ -697,3 +697,17 @@ def test_prioritize_and_coverage_say_what_settings_cut(store: str, sgstore: Any)
         code, _, err = sgstore(*words)
         assert code == 0, err
         assert [line for line in err.splitlines() if "lie beyond" in line] == [f"sgstore: {cut}"]
+
+
+def test_export_counts_the_matches_that_share_a_clip(
+    store: str, sgstore: Any, tmp_path: Path
+) -> None:
+    query = "MATCH (e:Ego)-[:near_coll]->(v:Truck|Van)"
+    apart = sgstore("export", store, query, "--to", tmp_path / "a", "--before=0s", "--after=0s")
+    joined = sgstore("export", store, query, "--to", tmp_path / "b", "--before=4s", "--after=4s")
+
+    assert (apart[0], "share a clip" in apart[2]) == (0, False)
+    assert (joined[0], "3 matches in 2 clips: matches that overlap share a clip" in joined[2]) == (
+        0,
+        True,
+    )

@@ -99,7 +99,7 @@ def export(
             lock=lock,
             parameters=parameters_of(question.parameters),
             progress=progress,
-            on_matches=say_left_out,
+            on_matches=_say_joined,
             **options,
         )
     if not written:
@@ -107,6 +107,14 @@ def export(
         return 0
     _write(written, out)
     return LOSS if any(one.losses for one in written) else 0
+
+
+def _say_joined(matches: Matches, clips: Sequence[Clip]) -> None:
+    """Print the notes about a query, and the number of matches if several share a clip."""
+    say_left_out(matches)
+    number = sum(1 for _ in matches.intervals())
+    if number > len(clips):
+        say(f"{number} matches in {len(clips)} clips: matches that overlap share a clip")
 
 
 def _write(written: Sequence[WrittenClip | WrittenFile], out: PrintedRows) -> None:
