@@ -49,7 +49,17 @@ WITHOUT_METHOD = {
 
 OWN_OPTIONS = {
     *("store", "file", "name", "names", "files", "checks", "every", "quiet", "verbose", "a", "b"),
-    *("tables", "timeout", "max_spill", "engine", "partial", "rows_as", "as_json", "require"),
+    *(
+        "tables",
+        "timeout",
+        "max_spill",
+        "engine",
+        "partial",
+        "rows_as",
+        "as_json",
+        "require",
+        "require_known",
+    ),
     *("to", "picture", "curve", "limit", "top", "threshold", "novel", "train", "test", "path"),
 }
 """Options of the process: where texts come from, limits, and the form of the output."""

@@ -140,3 +140,22 @@ def test_violations_are_results_for_code_scanning(store: Path, tmp_path: Path) -
     assert len(notices) == sum(one["verdict"] in {"unknown", "pending"} for one in verdicts)
     _, *arguments = shlex.split(found["results"][0]["properties"]["command"])
     assert run([*arguments, "-o", str(tmp_path / "a.png")]) == 0
+
+
+@pytest.mark.parametrize(
+    ("check", "options", "code"),
+    [
+        ("laned", "--require", 0),
+        ("laned", "--require-known", 4),
+        ("there", "--require-known", 0),
+        ("slow", "--require-known", 4),
+        ("slow", "", 0),
+    ],
+)
+def test_unknown_verdict_fails_only_if_known_verdicts_are_required(
+    store: Path, capsys: pytest.CaptureFixture[str], check: str, options: str, code: int
+) -> None:
+    (rule,) = (one for one in RULES.split(";") if f"CHECK {check}:" in one)
+
+    assert run(["check", str(store), "-e", rule.strip(), *options.split()]) == code
+    assert ("--require-known makes it 4" in capsys.readouterr().err) == (options == "--require")

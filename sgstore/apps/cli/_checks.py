@@ -32,7 +32,7 @@ from sgstore.base.display import number_of
 from sgstore.errors import SgstoreError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
     from sgstore.collection import CollectionChecks
     from sgstore.matches import Interval
@@ -50,6 +50,7 @@ def check(
     checks: Annotated[list[str] | None, Argument()] = None,
     explain: bool = False,
     require: bool = False,
+    require_known: bool = False,
     junit: Path | None = None,
     sarif: Path | None = None,
     evidence: Path | None = None,
@@ -71,7 +72,10 @@ def check(
     explain
         Print the parsed checks and their SQL.
     require
-        End with exit code 4 if a trace violates a check.
+        End with exit code 4 if a trace violates a check. The verdicts unknown and pending do
+        not count.
+    require_known
+        End with exit code 4 unless every verdict is true.
     junit : FILE
         Also write the verdicts as JUnit XML, for build servers.
     sarif : FILE
@@ -88,6 +92,7 @@ def check(
     if library:
         every = [one.name for one in patterns().values() if one.is_check]
         statements = replace(statements, names=[*(statements.names or ()), *every])
+    failing = {*(("false",) if require else ()), *(_UNMET if require_known else ())}
     asked, values = statements.asked(checks)
     text = joined([*chain.from_iterable(asked.values())])
     if (url := url_of(store)) is not None:
@@ -96,12 +101,12 @@ def check(
                 raise typer.BadParameter("--evidence is not supported for a collection")
             asked_of = opened.check(text, sgsm_compat=statements.sgsm_compat, **values)
             files = ReportFiles(str(store), junit, sarif, opened.traces)
-            return _reported(asked_of, ask, files, explain=explain, require=require)
+            return _reported(asked_of, ask, files, explain=explain, failing=failing)
     opened = ask.opened(store)
     run = opened.check(text, sgsm_compat=statements.sgsm_compat, **values)
     draw = None if evidence is None else partial(_draw_violations, opened, evidence)
     files = ReportFiles(str(store), junit, sarif, opened.traces, draw)
-    return _reported(run, ask, files, explain=explain, require=require)
+    return _reported(run, ask, files, explain=explain, failing=failing)
 
 
 @verbs.command(rich_help_panel=PANEL)
@@ -222,9 +227,12 @@ def _reported(
     files: ReportFiles,
     *,
     explain: bool,
-    require: bool,
+    failing: Collection[str],
 ) -> int:
-    """Print the verdicts of CHECK statements, or their explanation, and return the exit code."""
+    """Print the verdicts of CHECK statements, or their explanation, and return the exit code.
+
+    ``failing``: the verdicts that change the exit code.
+    """
     from sgstore.temporal import columns_returned, verdict_columns, verdict_rows
 
     if explain:
@@ -266,9 +274,22 @@ def _reported(
     for one, frames in absent.items():
         say(f"{one} is true, and an entity is absent in {frames} frame{'s' * (frames != 1)}")
     files.write(kept)
-    if tally["false"] and not require and not files and ask.for_people:
-        say(f"exit code 0; --require makes it {NO_MATCH}")
-    return NO_MATCH if require and tally["false"] else 0
+    code = NO_MATCH if any(tally.get(word) for word in failing) else 0
+    if not code and ask.for_people and not files:
+        _say_option(tally)
+    return code
+
+
+def _say_option(tally: Mapping[str, int]) -> None:
+    """Print the option with which the verdicts would change the exit code, if there is one."""
+    unmet = [word for word in _UNMET if tally.get(word)]
+    if unmet:
+        option = "--require" if tally["false"] else "--require-known"
+        say(f"exit code 0; {option} makes it {NO_MATCH}")
+
+
+_UNMET: Final = ("false", "unknown", "pending")
+"""Verdicts that ``--require-known`` rejects."""
 
 
 _DOCUMENT: Final = (
