@@ -33,7 +33,7 @@ from sgstore.maps.map_files import Maps, lost_lanes
 from sgstore.mcap import Findings, Loss, check_name, near
 from sgstore.model.config import ALL_EGOS, Config, from_dict
 from sgstore.model.trace_sampling import TracePart
-from sgstore.model.vocabulary import KIND_CODE, KINDS, kinds_labelled
+from sgstore.model.vocabulary import KIND_CODE, KINDS, VEHICLES, kinds_labelled
 from sgstore.model.world import covered_s, longest_step_ns
 from sgstore.pipeline.plausibility import Plausibility
 from sgstore.readers import TopicReading, on_map, open_trace
@@ -214,6 +214,9 @@ class Job:
 SHOWN: Final = 20
 """Largest number of jumps and gaps that a report lists. Further ones are counted."""
 
+_CANDIDATES: Final = 5
+"""Largest number of vehicles that a warning about a missing ego lists."""
+
 
 @dataclass(slots=True)
 class TraceTally:
@@ -230,10 +233,13 @@ class TraceTally:
         Check for implausible data.
     noise : float
         Noise of the positions; m.
+    present : dict or None
+        Vehicles in all frames so far: node id → id and kind. Empty with an ego; None before the first frame.
     """
 
     frames: int = 0
     noise: float = 0.0
+    present: dict[int, str] | None = None
     kinds: Counter[int] = field(default_factory=Counter[int])
     times: array[int] = field(default_factory=lambda: array("q"))
     checked: Plausibility = field(default_factory=Plausibility)
@@ -245,6 +251,30 @@ class TraceTally:
         self.kinds.update(frames.entities.kind.tolist())
         self.times.frombytes(frames.time_ns.astype(np.int64).tobytes())
         self.checked.see(frames)
+        if self.present != {} and len(frames):
+            self._keep_present(frames)
+
+    def _keep_present(self, frames: FrameBlock) -> None:
+        """Remove the vehicles that are not in all frames of a block."""
+        if self.present is None:
+            new = frames.entities
+            called = zip(new.ident, (KINDS[code] for code in new.kind.tolist()), strict=True)
+            self.present = {
+                node: f"{ident} ({kind})"
+                for node, (ident, kind) in enumerate(called, start=new.first)
+                if kind in VEHICLES
+            }
+        nodes, counts = np.unique(frames.states.node, return_counts=True)
+        whole = set() if (frames.ego >= 0).any() else {*nodes[counts == len(frames)].tolist()}
+        self.present = {node: text for node, text in self.present.items() if node in whole}
+
+    @property
+    def ego_hint(self) -> str:
+        """Remedy for a missing ego: the option, and the vehicles that are present in all frames."""
+        known = [*(self.present or {}).values()]
+        more = f", … ({len(known)} in all)" if len(known) > _CANDIDATES else ""
+        listed = f"in all frames: {', '.join(known[:_CANDIDATES])}{more}"
+        return f"name the ego with --ego ID; {listed if known else 'no vehicle is in all frames'}"
 
     @property
     def entities(self) -> dict[str, int]:
@@ -587,6 +617,8 @@ class SegmentReader:
         moot += [one.value for one in found]
         warnings = [warning for warning in report.warnings if warning not in moot]
         warnings += [str(one) for one in found if not (egos and one.kind == "ego missing")]
+        if report.about_ego and not egos and not group[0].info.ego:
+            warnings.append(tally.ego_hint)
         for one, segment in zip(group, segments, strict=True):
             outcome = one.outcome
             if egos and not one.met:

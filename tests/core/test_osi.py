@@ -24,6 +24,7 @@ from thorough import share_of
 import sgstore
 import sgstore.readers._blocks as frames
 from sgstore.errors import TraceError
+from sgstore.ingest import ingest
 from sgstore.model.vocabulary import KINDS, LIGHT_STATES, VEHICLE_LIGHTS
 from sgstore.model.world import FASTEST, POSE, FrameBlock, States, TraceInfo, TraceReport
 from sgstore.readers import message_class, open_trace
@@ -799,6 +800,21 @@ def test_a_host_that_is_not_there_means_no_ego_and_is_said(
     assert info.ego == ""
     assert blocks[0].ego.tolist() == [-1]
     assert any("no host vehicle" in warning for warning in report.warnings)
+
+
+def test_ingest_without_ego_lists_vehicles_that_are_in_all_frames(tmp_path: Path) -> None:
+    always = [car(number) for number in range(2, 9)]
+    frames = [{"moving": always + [car(1)] * (i != 40), "host": None} for i in range(80)]
+    (many,) = ingest(tmp_path / "a.sgstore", [record(tmp_path / "a.mcap", frames)])
+    frames = [{"moving": [car(i // 10)], "host": None} for i in range(80)]
+    (none,) = ingest(tmp_path / "b.sgstore", [record(tmp_path / "b.mcap", frames)])
+    (named,) = ingest(tmp_path / "c.sgstore", [tmp_path / "a.mcap"], egos=["3"])
+
+    listed = ", ".join(f"{number} (car)" for number in range(2, 7))
+    hint = "name the ego with --ego ID; "
+    assert f"{hint}in all frames: {listed}, … (7 in all)" in many.warnings
+    assert f"{hint}no vehicle is in all frames" in none.warnings
+    assert not any("--ego" in warning for warning in named.warnings)
 
 
 def test_the_host_of_a_sensor_view_comes_before_that_of_the_truth_in_it(tmp_path: Path) -> None:
