@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 import shlex
 from typing import TYPE_CHECKING
+from urllib.parse import unquote
 from xml.etree import ElementTree as Xml
 
 import pytest
 from recordings import drive
 
+import sgstore
 from sgstore.apps.cli import run
 from sgstore.ingest import ingest
+from sgstore.lang.library import pattern_named
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -159,3 +162,31 @@ def test_unknown_verdict_fails_only_if_known_verdicts_are_required(
 
     assert run(["check", str(store), "-e", rule.strip(), *options.split()]) == code
     assert ("--require-known makes it 4" in capsys.readouterr().err) == (options == "--require")
+
+
+def test_sarif_describes_library_rules_and_names_recordings_in_the_working_folder(
+    store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "checks.sarif"
+    recordings = {trace.name: trace.path for trace in sgstore.open(store).traces()}
+    monkeypatch.chdir(recordings["town"].parent)
+
+    rules = ["-p", "no_collision", "-e", "CHECK slow: ALWAYS ego.speed < 3"]
+    assert run(["check", str(store), *rules, "--sarif", str(file)]) == 0
+    (found,) = json.loads(file.read_text())["runs"]
+    described = {rule["id"]: rule for rule in found["tool"]["driver"]["rules"]}
+    places = {
+        one["properties"]["trace"]: one["locations"][0]["physicalLocation"]["artifactLocation"]
+        for one in found["results"]
+    }
+
+    entry = pattern_named("no_collision")
+    assert described["no_collision"]["shortDescription"] == {"text": entry.sentence}
+    assert entry.source in described["no_collision"]["help"]["text"]
+    assert described["slow"] == {"id": "slow"}
+    assert unquote(places["town"]["uri"]) == recordings["town"].name
+    assert all(
+        unquote(places[name]["uri"]) == str(path)
+        for name, path in recordings.items()
+        if name != "town" and name in places
+    )

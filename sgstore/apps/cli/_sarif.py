@@ -6,6 +6,7 @@ Source: OASIS Standard, "Static Analysis Results Interchange Format (SARIF) Vers
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import quote
 
@@ -13,7 +14,6 @@ from sgstore.base.output_files import write_bytes
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
-    from pathlib import Path
 
     from sgstore.apps.cli._junit import Evidence
     from sgstore.temporal import Verdict
@@ -48,7 +48,8 @@ def write_sarif(
     results: list[dict[str, Any]] = []
     notices: list[dict[str, Any]] = []
     for one in verdicts:
-        rules.setdefault(one.check, {"id": one.check})
+        if one.check not in rules:
+            rules[one.check] = _rule(one.check)
         if one.verdict in {"unknown", "pending"}:
             text = f"{one.check} is {one.verdict} for {one.trace}"
             text = f"{text}: {one.reason}" if one.reason else text
@@ -95,7 +96,23 @@ def _address() -> str:
     return named.get("Source", _PACKAGE)
 
 
+def _rule(check: str) -> dict[str, Any]:
+    """Return a check as a rule, with the sentence and the source of a library pattern."""
+    from sgstore.lang.library import patterns
+
+    rule: dict[str, Any] = {"id": check}
+    entry = patterns().get(check)
+    if entry is not None and entry.is_check:
+        rule["shortDescription"] = {"text": entry.sentence}
+        if entry.source:
+            rule["help"] = {"text": f"Source: {entry.source}"}
+    return rule
+
+
 def _location(trace: str, recording: str) -> dict[str, Any]:
+    path = Path(recording)
+    if path.is_absolute() and path.is_relative_to(Path.cwd()):  # code scanning needs relative paths
+        recording = path.relative_to(Path.cwd()).as_posix()
     return {
         "physicalLocation": {"artifactLocation": {"uri": quote(recording)}},
         "logicalLocations": [{"name": trace, "kind": "object"}],
