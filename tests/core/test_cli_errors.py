@@ -205,3 +205,11 @@ def test_option_that_is_similar_to_no_other_has_no_suggestion(
 def test_misspelt_option_has_a_suggestion(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["show", "x", "--verbos"]) == 2
     assert "write: sgstore show x --verbose" in capsys.readouterr().err
+
+
+def test_option_of_other_commands_names_them(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["show", "x", "y", "--graph", "--abstraction", "roadscene2vec"]) == 2
+    written = " ".join(capsys.readouterr().err.split())
+    head, _, names = written.partition("No such option: --abstraction; it is an option of: ")
+    assert head
+    assert {"export", "like", "coverage classes"} <= {*names.split(", ")}

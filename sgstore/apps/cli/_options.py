@@ -282,6 +282,8 @@ def _advise(error: Any, verb: Verb, ctx: Any, args: list[str]) -> None:
         error.possibilities = None
         if line := _option_instead(verb, ctx, args, name):
             error.message = f"No such option: {name}; write: {line}"
+        elif others := _commands_with(ctx.find_root().command, name):
+            error.message = f"No such option: {name}; it is an option of: {', '.join(others)}"
     stores = [one for one in args if _is_database(one)] if _places(verb) else []
     if len(stores) > 1 and "extra argument" in str(getattr(error, "message", "")):
         error.message = _several_stores(ctx, stores)
@@ -310,6 +312,15 @@ def _several_stores(ctx: Any, stores: Sequence[str]) -> str:
 def _words_of(verb: Verb) -> list[str]:
     """Return the words of all options of a command, sorted."""
     return sorted({word for one in verb.params for word in (*one.opts, *one.secondary_opts)})
+
+
+def _commands_with(command: Any, option: str, path: tuple[str, ...] = ()) -> list[str]:
+    """Return the commands of a group, and of its groups, that have an option."""
+    inner = getattr(command, "commands", None)
+    if inner is None:
+        return [" ".join(path)] if option in _words_of(command) else []
+    found = (_commands_with(one, option, (*path, name)) for name, one in inner.items())
+    return sorted(name for names in found for name in names)
 
 
 def _places(verb: Verb) -> list[str]:
@@ -447,7 +458,8 @@ def _option_instead(verb: Verb, ctx: Any, args: list[str], name: str) -> str:
             [*ctx.command_path.split(), args[place + 1], *args[:place], *args[place + 2 :]]
         )
     bare = {word.lstrip("-"): word for word in known}  # dashes would make all options similar
-    close = get_close_matches(name.lstrip("-"), bare, 1)
+    elsewhere = len(name) > 2 and _commands_with(ctx.find_root().command, name)
+    close = get_close_matches(name.lstrip("-"), bare, 1, 0.8 if elsewhere else 0.6)
     new = next(iter([*others, *(bare[word] for word in close)]), "")
     fixed = [f"{new}{one[len(name) :]}" if one.partition("=")[0] == name else one for one in args]
     return "" if not new or fixed == args else shlex.join([*ctx.command_path.split(), *fixed])
