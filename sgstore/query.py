@@ -373,7 +373,8 @@ class StoreVerbs:
         Returns
         -------
         ReportTable
-            ``trace``, ``src``, ``dst``, ``kind``, and each measure.
+            ``trace``, ``src``, ``dst``, ``kind``, and each measure. The first rows are the most critical ones
+            by the first measure, then by the next ones. Pairs without any value are left out.
 
         Raises
         ------

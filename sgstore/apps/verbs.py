@@ -193,14 +193,22 @@ def criticality(
     from sgstore.model.criticality import RECORDED, recorded
     from sgstore.testsets.coverage import ReportTable
 
-    found = recorded(one_store(store), tuple(measures or RECORDED))
+    chosen = tuple(measures or RECORDED)
+    found = recorded(one_store(store), chosen)
     first = found.columns.index("kind") + 1
+    signs = [-1 if RECORDED[name].worse == "high" else 1 for name in chosen]
+
+    def harm(row: tuple[Any, ...]) -> list[tuple[bool, float]]:
+        values = zip(row[first:], signs, strict=True)
+        return [(value is None, 0 if value is None else sign * value) for value, sign in values]
+
     rows = [
         row
         for row in found.values
-        if most is None or (row[first] is not None and row[first] <= most)
+        if any(value is not None for value in row[first:])
+        and (most is None or (row[first] is not None and row[first] <= most))
     ]
-    return ReportTable(found.columns, rows)
+    return ReportTable(found.columns, sorted(rows, key=harm))
 
 
 def coverage(  # noqa: PLR0913 - the options of the command

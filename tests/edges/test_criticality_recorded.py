@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import math
 import os
 import shutil
@@ -499,3 +500,27 @@ def test_the_page_lists_the_recorded_measures() -> None:
         page = expected
 
     assert page == expected
+
+
+def test_the_verb_lists_the_most_critical_encounters_with_names(town_store: Path) -> None:
+    line = ["criticality", str(town_store), "-m", "pet", "-m", "cpi"]
+    rows = json.loads(CliRunner().invoke(app, [*line, "--json"]).stdout)
+    table = CliRunner().invoke(app, line)
+    short = CliRunner().invoke(app, [*line, "--limit", "3"])
+    pets = [row["pet"] for row in rows if row["pet"] is not None]
+
+    assert pets == sorted(pets)
+    assert [row["pet"] for row in rows[: len(pets)]] == pets
+    assert len(rows) > 40
+    assert table.stdout.splitlines()[0].split() == ["trace", "ego", "other", "pet", "cpi"]
+    assert f"town   car 0  {rows[0]['kind']} {rows[0]['dst']}" in table.stdout
+    assert len(table.stdout.splitlines()) == 2 + 40
+    assert f"{len(rows) - 3} more rows; --limit 0 shows all" in short.stderr
+
+
+def test_encounters_without_a_value_are_left_out(open_town: Store) -> None:
+    every = recorded(open_town, ["pet"]).dicts()
+    known = [row for row in every if row["pet"] is not None]
+
+    assert 0 < len(known) < len(every)
+    assert len(open_town.criticality(measures=["pet"]).rows) == len(known)

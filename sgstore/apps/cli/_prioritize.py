@@ -12,6 +12,7 @@ import typer
 from typer import Option
 
 from sgstore.apps.cli._coverage import PANEL
+from sgstore.apps.cli._coverage import Limit as TableLimit
 from sgstore.apps.cli._options import (
     CaseUnit,
     Limit,
@@ -28,6 +29,8 @@ from sgstore.apps.cli._output import say
 from sgstore.apps.cli._testsets import Payloads, check_lock_name, say_chosen, write_lock
 
 if TYPE_CHECKING:
+    from sgstore.query import Store
+    from sgstore.testsets.coverage import ReportTable
     from sgstore.testsets.selection import Prioritized
 
 
@@ -39,21 +42,36 @@ def criticality(
     store: StorePath,
     measures: Annotated[list[str] | None, Option("--measure", "-m")] = None,
     most: float | None = None,
+    limit: TableLimit = None,
     *,
     out: RowOptions,
     bounds: QueryLimits,
 ) -> None:
     """List measures of recorded encounters of two entities: PET, TET, CPI, the closest encounter.
 
-    A row is the ego of a trace and one of those that it could meet: the view
-    encounters in SQL. In patterns they are functions, as in pet(e, v) < 1.5.
+    A row is the ego of a trace and one of those that it could meet, the most critical ones
+    first: the view encounters in SQL. In patterns they are functions, as in pet(e, v) < 1.5.
     """
     from sgstore.testsets.coverage import ChosenFrames
 
     opened = bounds.opened(store)
     found = opened.criticality(measures=measures or (), most=most)
     say_chosen(ChosenFrames(str(store), opened), out, world=True)
-    out.report(found)
+    out.report(_with_names(opened, found) if out.for_people and not out.file else found, limit)
+
+
+def _with_names(store: Store, table: ReportTable) -> ReportTable:
+    """Return the table of encounters with names of entities (car 17) in place of numbers."""
+    from sgstore.testsets.coverage import ReportTable
+
+    traces = {one.trace_id: one.name for one in store.traces()}
+    found = store.sql("SELECT trace_id, node_id, name FROM entities")
+    names = {(traces[trace], node): name for trace, node, name in found}
+    rows = [
+        (trace, names.get((trace, src), src), names.get((trace, dst), f"{kind} {dst}"), *values)
+        for trace, src, dst, kind, *values in table.rows
+    ]
+    return ReportTable(("trace", "ego", "other", *table.columns[4:]), rows, table.said)
 
 
 @dataclass(frozen=True)
