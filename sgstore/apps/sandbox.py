@@ -509,7 +509,7 @@ class SandboxPool:
                 self._asked.pop(key, None)
 
     def cancel(self, key: str) -> bool:
-        """Stop the running query with this key. Return False if there is no such query."""
+        """Stop the running query with this key. Return False if no query has this key."""
         with self._changed:
             box = self._asked.pop(key, None)
             known = box is not None or key in self._asked

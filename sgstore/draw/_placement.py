@@ -53,7 +53,7 @@ class Placer:
     def beside(
         self, x: float, y: float, reach: tuple[float, float], size: tuple[float, float]
     ) -> tuple[float, float] | None:
-        """Reserve the nearest free place for a text beside an object; return the middle of that place.
+        """Reserve the free place for a text that is nearest to an object; return the middle of that place.
 
         Parameters
         ----------

@@ -201,7 +201,7 @@ def _spans(intervals: Iterable[Interval], *, violation: bool) -> list[LaneSpan]:
 
 
 def lines_of(timeline: Timeline, letters: int = LETTERS, longest: float = 0.0) -> list[str]:
-    """Return a timeline as lines of text. Each letter stands for an equal part of the time.
+    """Return a timeline as lines of text. All letters cover equal parts of the time.
 
     ``█``: true, or violated, for most of the part; ``▌``: for some of it; ``·``: for none of it.
 

@@ -261,7 +261,7 @@ class _Cutting:
             yield number, channel.topic, schema.name if schema else ""
 
     def _write_head(self, reach: Clip) -> list[Loss]:
-        """Write the schemas, channels, metadata and attachments of the recording. Return what was lost.
+        """Write the schemas, channels, metadata and attachments of the recording. Return the losses.
 
         ``reach`` is the interval with a time tolerance at its ends, as readers of the clip need it.
         """

@@ -577,7 +577,7 @@ def _rows_text(reply: Mapping[str, Any]) -> str:
 
 
 def _lines(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> tuple[list[str], int]:
-    """Return a header and as many rows as fit, as lines of text. Also return the number of these rows."""
+    """Return lines of text: a header, and the first rows that fit. Also return the number of these rows."""
     lines = [" | ".join(columns)]
     left = MOST_TEXT
     for number, row in enumerate(rows):

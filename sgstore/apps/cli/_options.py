@@ -805,7 +805,7 @@ class Question:
         return bool(self.query or self.file or self.name)
 
     def typed(self) -> str:
-        """Query as the user typed it, or the name of a library pattern; empty if there is none."""
+        """Query as the user typed it, or the name of a library pattern; empty without a query."""
         if sum(source is not None for source in (self.query, self.file, self.name)) > 1:
             raise typer.BadParameter("expected one of: a query, -f FILE, -p NAME")
         return (self.name or query_of(self.query, self.file)) if self else ""
