@@ -16,6 +16,8 @@ import pytest
 from carla_recordings import read, states
 from thorough import LONG
 
+from sgstore.model.vocabulary import LIGHT_STATE_CODE
+
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
@@ -107,18 +109,24 @@ def test_every_frame_that_is_saved_is_what_it_was(
             )
 
 
-def test_lights_hold_over_a_hole(had: Had, whole: dict[int, dict[str, Any]]) -> None:
-    """The message that changed them at 10 s lies in the hole: behind it they are as they were before."""
-    _, blocks, _ = had("flipped_chunk")
-    found = states(blocks)
+def test_lights_are_unknown_after_a_hole(had: Had, whole: dict[int, dict[str, Any]]) -> None:
+    """The messages that changed them at 10 and 12 s lie in the hole; no later frame has a message."""
+    _, blocks, report = had("flipped_chunk")
     shown = [
-        {i: s["light_state"] for i, s in frame.items() if s["light_state"] >= 0} for frame in found
+        [s["light_state"] for s in frame.values() if s["light_state"] >= 0]
+        for frame in states(blocks)
     ]
-    truly = [{i: frame[i]["light_state"] for i in shown[0]} for frame in whole.values()]
+    truly = [
+        [s["light_state"] for s in frame.values() if s["light_state"] >= 0]
+        for frame in whole.values()
+    ]
 
-    assert shown[98] == shown[99] == truly[98]
+    assert shown[:99] == truly[:99]
     assert truly[132] != truly[98]
-    assert len(shown[0]) == 36
+    unknown = LIGHT_STATE_CODE["unknown"]
+    assert [set(frame) for frame in shown[99:]] == [{unknown}] * 68
+    assert {len(frame) for frame in shown} == {36}
+    assert any("unknown in 68 frames" in warning for warning in report.warnings)
 
 
 def test_only_what_is_unusable_is_left_out(had: Had, whole: dict[int, dict[str, Any]]) -> None:

@@ -626,6 +626,10 @@ class Lights:
         if (states != self._states).any():
             self._states = states
 
+    def forget(self) -> None:
+        """Set the states of all traffic lights to unknown, until the next message with states."""
+        self._states = np.full_like(self._states, LIGHT_STATE_CODE["unknown"])
+
     def _enter(self, ident: int) -> int:
         meaning = TypeMeaning("traffic_light")
         return self._roster.enter(str(ident), meaning, TYPE_NAME, self._signals.get(ident, ""))

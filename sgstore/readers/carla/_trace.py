@@ -32,6 +32,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import numpy as np
 
+from sgstore.base.display import number_of
 from sgstore.errors import MapError, TraceError
 from sgstore.maps.opendrive import read_map
 from sgstore.model.vocabulary import CONTROL, KINDS
@@ -185,6 +186,8 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
         self._take = self._takers()
         self.channels = self._leading | {*self._take}
         self._lights = Lights(survey.lights, signals, road_map, self.roster)
+        self._lights_at, self._unread_ns = 0, -1
+        self._losses = self._without_lights = 0
 
     def decode(self, run: Messages, row: int) -> CarlaRawFrame | None:
         """Return the frame in a CARLA message, before conversion; ``None`` if not a frame, or unreadable."""
@@ -216,6 +219,11 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
                 f"{self._lights.aimless} traffic lights are no signal of the road map, and their boxes are on"
                 " none of its lanes: for which lanes they are is not known"
             )
+        if self._without_lights:
+            warn(
+                f"the states of traffic lights are unknown in {number_of(self._without_lights, 'frame')}:"
+                " an unreadable part of the file may contain them"
+            )
         self._report.warnings += self._lights.warnings
         super().settle()
         if not self._survey.egos.actors:
@@ -237,6 +245,9 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
                 self._enter(ident, classification)
             elif classification != self._classes[ident]:
                 kinds |= self._other(ident, classification)
+        if self._may_lack_light_states():
+            self._lights.forget()
+            self._without_lights += 1
         frame = CarlaRawFrame(
             time_ns,
             log_time,
@@ -402,8 +413,16 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
                 takers[channel] = self._take_event
         return takers
 
-    def _take_light_states(self, channel: int, _log_time: int, data: memoryview) -> None:
+    def _take_light_states(self, channel: int, log_time: int, data: memoryview) -> None:
         self._lights.update(decode(self._survey.structures[channel], data))
+        self._lights_at = log_time
+
+    def _may_lack_light_states(self) -> bool:
+        """True if an unreadable part of the file may contain later light states than the latest message."""
+        losses = self._report.losses
+        self._unread_ns = max([self._unread_ns, *(one.end_ns for one in losses[self._losses :])])
+        self._losses = len(losses)
+        return self._lights_at <= self._unread_ns
 
     def _take_controls(self, channel: int, log_time: int, data: memoryview) -> None:
         told = self._fields[channel].read(data)[1][0]
