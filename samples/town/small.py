@@ -1,4 +1,4 @@
-"""The small sample that a wheel brings: the town without its lidar, and with a picture every two seconds.
+"""The small sample that a wheel brings: the town without its lidar, and with a picture every three seconds.
 
     python samples/town/small.py [SOURCE.mcap [TARGET.mcap]]
 
@@ -18,7 +18,7 @@ SOURCE, TARGET = SAMPLE / "town.mcap", SAMPLE / "small" / "town.mcap"
 
 LEFT_OUT = "/ego/lidar/points"
 PICTURES = "/ego/camera/front/image"
-STEP = 2_000_000_000
+STEP = 3_000_000_000
 
 
 def write(source: Path, target: Path) -> None:

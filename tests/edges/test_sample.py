@@ -554,7 +554,7 @@ def test_the_map_in_the_recording_is_the_one_beside_the_script(sample: Sample) -
 # The small one, which a wheel brings ------------------------------------------------------------------
 
 
-def test_the_small_sample_is_the_town_without_lidar_and_with_a_picture_every_two_seconds(
+def test_the_small_sample_is_the_town_without_lidar_and_with_a_picture_every_three_seconds(
     tmp_path: Path,
 ) -> None:
     def held(path: Path) -> list[tuple[str, int, int, int, bytes]]:
@@ -570,5 +570,5 @@ def test_the_small_sample_is_the_town_without_lidar_and_with_a_picture_every_two
 
     assert [one for one in small if one[0] != IMAGE] == others
     assert set(pictures) <= set(whole)
-    assert [one[1] // 2_000_000_000 for one in pictures] == list(range(38))
+    assert [one[1] // 3_000_000_000 for one in pictures] == list(range(25))
     assert SMALL.stat().st_size < 1e6
