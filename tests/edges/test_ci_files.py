@@ -172,18 +172,18 @@ def entries() -> dict[str, tuple[str, str]]:
     ("hook", "name", "text", "code", "reason"),
     [
         ("sgstore-queries", "a.sgql", RULES, 0, "1 of 1 file without a mistake"),
-        ("sgstore-queries", "a.sgql", "MATCH (e:Ego) WHERE e.speed > $x", 0, "no mistake"),
+        ("sgstore-queries", "a.sgql", "MATCH (e:Ego) WHERE e.speed > $x", 0, "without a mistake"),
         (
             "sgstore-queries",
             "a.sgql",
             "DEFINE PREDICATE c(a, b) AS gap(a, b) < 3;",
             0,
-            "no mistake",
+            "without a mistake",
         ),
         ("sgstore-queries", "a.sgql", "MATCH (e:Ego) WHERE e.sped > 3", 1, "did you mean 'speed'?"),
-        ("sgstore-queries", "a.sgql", UNION, 0, "no mistake"),
+        ("sgstore-queries", "a.sgql", UNION, 0, "without a mistake"),
         ("sgstore-queries", "a.sgql", f"{UNION}.sped", 1, "unknown attribute 'sped'"),
-        ("sgstore-queries", "a.sgql", f"{RULES}; MATCH (e:Ego)", 0, "no mistake"),
+        ("sgstore-queries", "a.sgql", f"{RULES}; MATCH (e:Ego)", 0, "without a mistake"),
         (
             "sgstore-queries",
             "a.sgql",

@@ -386,4 +386,4 @@ def test_a_shard_names_its_traces(tmp_path: Path, capsys: Any) -> None:
     command = ["ingest", str(tmp_path / "fleet"), str(tmp_path / "one.mcap"), "--shard", "1/1"]
 
     assert run(command) == 0
-    assert "share 1/1 of 1 recordings: one" in capsys.readouterr().err
+    assert "share 1/1 of 1 recording: one" in capsys.readouterr().err

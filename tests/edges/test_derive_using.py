@@ -179,7 +179,7 @@ def test_roadscene2vec_can_be_kept_and_asked(stores) -> None:
     assert {row for row in found if row[0] in range(0, 200, 40)} == wanted
     assert wanted
     assert not store.file.verify().faults
-    with pytest.raises(AbstractionError, match="as it is"):
+    with pytest.raises(AbstractionError, match="without a derived set"):
         keep_abstraction(store.file.path, "RSV")
 
 

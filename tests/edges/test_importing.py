@@ -604,7 +604,7 @@ def test_the_verb_imports_and_its_exit_code_says_what_was_lost(
 
     assert codes == [0, 1, 3, 2]
     assert json.loads(out[: out.index("]") + 1])[0]["frames"] == 2
-    assert "relation guards: 1 times, cannot be kept" in err
+    assert "relation guards: 1 time, cannot be kept" in err
     assert "'elf' is an unknown kind" in err
 
 
