@@ -73,7 +73,9 @@ class Reads:
         with self._looking:  # after a change one thread reads, and the others wait
             stamp = self._store.file.stamp
             catalog = self._store.catalog()
-            if self._known is None or self._known[0] is not catalog:
+            known = self._known
+            # The file may have changed between its stamp and its catalog.
+            if known is None or known[0] is not catalog or known[2]["stamp"] != stamp:
                 with self._store.file.snapshot():
                     traces = {one.name: one for one in self._store.traces()}
                     self._known = catalog, traces, self._told(traces) | {"stamp": stamp}
