@@ -624,7 +624,7 @@ class SceneGraphGenerator:
         >>> frame.add("hero", "car", 0, 0, length=-4.5)
         >>> graph = generator.step(frame)
         >>> [loss.reason for loss in generator.losses]
-        ["length of entity 'hero' is -4.5 m: missing in 1 states"]
+        ["length of entity 'hero' is -4.5 m: missing in 1 state"]
         """
         faults = self._online.faults.losses() if self._online is not None else []
         return [*self._crowds.losses(self._config), *faults]

@@ -279,7 +279,7 @@ class Plausibility:
         >>> len(list(checked.watched(frames)))
         3
         >>> print(checked.findings()[0])
-        doubled stamps: simulation time stands still 1 times; frame 2 (0.1 s); write the time of each frame once
+        doubled stamps: simulation time stands still 1 time; frame 2 (0.1 s); write the time of each frame once
         """
         waiting: list[Frame] = []
         try:

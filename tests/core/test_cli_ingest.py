@@ -132,7 +132,7 @@ def test_a_part_and_egos_are_asked_for_by_options(tmp_path) -> None:
     rows = [(row["trace"], row["ego"], row["frames"]) for row in json.loads(run.stdout)]
     assert rows == [("d", "Ego", 9), ("d~2", "3", 9)]
     told = sgstore("info", tmp_path / "s.db", "--trace", "d~2").stdout.decode()
-    assert "part         from 1 s, to 5 s, 2 frames a second" in told
+    assert "from 1 s, to 5 s, 2 frames a second" in told
 
 
 def test_what_was_read_otherwise_is_refused_and_replaced_by_force(tmp_path) -> None:

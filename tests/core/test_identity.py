@@ -345,7 +345,7 @@ def test_numbers_that_no_body_has_are_missing_in_a_frame() -> None:
     online = SceneGraphGenerator(None, Config())
     graph = online.step(frame)
     reasons = [loss.reason for loss in online.losses]
-    assert reasons[0] == "length of entity 'a' is -4.5 m: missing in 1 states"
+    assert reasons[0] == "length of entity 'a' is -4.5 m: missing in 1 state"
     assert len(reasons) == 3
     about = {node["ident"]: node for node in graph.nodes.values()}
     assert "length" not in about["a"]
@@ -592,7 +592,7 @@ def test_gaps_are_listed_by_info_and_doctor(
     path = write_osi(tmp_path / "gap", [(t, [Body(7, 0.0)]) for t in times])
     store = str(tmp_path / "s.sgstore")
     assert run(["ingest", store, str(path)]) == 0
-    assert "1 gaps longer than three periods" in capsys.readouterr().err
+    assert "1 gap longer than three periods" in capsys.readouterr().err
     assert run(["info", store]) == 0
     assert "gap: 1 gap; info" in capsys.readouterr().err
     for command in (["info", store, "--trace", "gap"], ["doctor", str(path)]):

@@ -208,7 +208,8 @@ def _say_warnings(outcome: TraceOutcome) -> None:
     if outcome.error:
         complain(str(outcome.error))
     for name, number in outcome.unknown_types.items():
-        say(f"{place_named(outcome.path)}: {number} of type {name!r}, {_no_kind(name)}")
+        many = f"{number} {'entity' if number == 1 else 'entities'} of type {name!r}"
+        say(f"{place_named(outcome.path)}: {many}, {_no_kind(name)}")
     for warning in outcome.warnings:
         say(f"{place_named(outcome.path)}: {warning}")
     for loss in outcome.losses:
