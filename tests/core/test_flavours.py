@@ -557,8 +557,8 @@ def test_an_entity_without_a_position_is_a_loss(tmp_path: Path, plain_reader: No
 
     assert "tree" not in idents(blocks)
     assert [loss.reason for loss in report.losses] == [
-        "position of entity 'tree' is unknown: missing in 1 states",
-        "position of entity 'leaf' is unknown: missing in 1 states",
+        "position of entity 'tree' is unknown: missing in 1 state",
+        "position of entity 'leaf' is unknown: missing in 1 state",
     ]
 
 

@@ -1352,7 +1352,7 @@ def test_conditions_that_are_malformed_cost_nothing_else(tmp_path: Path) -> None
     _, _, report = read(path)
 
     assert (report.frames, report.events, report.losses) == (1, [], [])
-    assert report.warnings == ["weather and light cannot be read where they changed 1 times"]
+    assert report.warnings == ["weather and light cannot be read where they changed 1 time"]
 
 
 def test_an_id_with_much_behind_it_is_an_id(tmp_path: Path) -> None:

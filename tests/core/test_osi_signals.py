@@ -168,7 +168,7 @@ def test_assignments_without_end_cost_only_their_light(tmp_path: Path) -> None:
     assert applies(path) == {"80": [], "201": ["2"]}
     with open_trace(path) as trace:
         assert sum(map(len, trace.blocks())) == 3
-        assert "traffic lights cannot be read where they changed 1 times" in trace.report.warnings
+        assert "traffic lights cannot be read where they changed 1 time" in trace.report.warnings
 
 
 @pytest.mark.data
