@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pytest
-from carla_recordings import read, states
+from carla_recordings import Bridge, light, read, states, vehicle
+from mcap.reader import make_reader
 from thorough import LONG
 
 from sgstore.model.vocabulary import LIGHT_STATE_CODE
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
     Had = Callable[[str], tuple[Any, list[Any], Any]]
 
 pytestmark = [pytest.mark.data, pytest.mark.seconds(6)]
+
+UNKNOWN = LIGHT_STATE_CODE["unknown"]
 
 
 class Hurt(NamedTuple):
@@ -107,6 +110,8 @@ def test_every_frame_that_is_saved_is_what_it_was(
             assert [s[column] for s in ours.values()] == pytest.approx(
                 [s[column] for s in theirs.values()], abs=0, nan_ok=True
             )
+        for ident, one in ours.items():
+            assert one["light_state"] in {UNKNOWN, theirs[ident]["light_state"]}
 
 
 def test_lights_are_unknown_after_a_hole(had: Had, whole: dict[int, dict[str, Any]]) -> None:
@@ -123,10 +128,33 @@ def test_lights_are_unknown_after_a_hole(had: Had, whole: dict[int, dict[str, An
 
     assert shown[:99] == truly[:99]
     assert truly[132] != truly[98]
-    unknown = LIGHT_STATE_CODE["unknown"]
-    assert [set(frame) for frame in shown[99:]] == [{unknown}] * 68
+    assert [set(frame) for frame in shown[99:]] == [{UNKNOWN}] * 68
     assert {len(frame) for frame in shown} == {36}
     assert any("unknown in 68 frames" in warning for warning in report.warnings)
+
+
+@pytest.mark.parametrize("lights", [True, False])
+def test_only_a_recording_with_light_states_can_lose_them(tmp_path: Path, lights: bool) -> None:
+    path = tmp_path / "drive.mcap"
+    with Bridge(path, chunk_size=400) as bridge:
+        if lights:
+            bridge.light_places([light(7, 5.0, 3.0)])
+            bridge.light_states({7: 0}, 0.0)
+        for i in range(20):
+            bridge.objects(0.1 * i, [vehicle(100, 0.5 * i)])
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    hurt, place = bytearray(path.read_bytes()), summary.chunk_indexes[-2]
+    start = place.chunk_start_offset + place.chunk_length - place.compressed_size
+    hurt[start : start + 8] = b"\xff" * 8
+    path.write_bytes(hurt)
+
+    _, blocks, report = read(path)
+
+    assert report.losses
+    assert 0 < sum(map(len, blocks)) < 20
+    assert any("states of traffic lights" in one for one in report.warnings) is lights
 
 
 def test_only_what_is_unusable_is_left_out(had: Had, whole: dict[int, dict[str, Any]]) -> None:

@@ -186,7 +186,8 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
         self._take = self._takers()
         self.channels = self._leading | {*self._take}
         self._lights = Lights(survey.lights, signals, road_map, self.roster)
-        self._lights_at, self._unread_ns = 0, -1
+        self._lights_at: int | None = None
+        self._unread_ns = -1
         self._losses = self._without_lights = 0
 
     def decode(self, run: Messages, row: int) -> CarlaRawFrame | None:
@@ -420,9 +421,10 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
     def _may_lack_light_states(self) -> bool:
         """True if an unreadable part of the file may contain later light states than the latest message."""
         losses = self._report.losses
-        self._unread_ns = max([self._unread_ns, *(one.end_ns for one in losses[self._losses :])])
-        self._losses = len(losses)
-        return self._lights_at <= self._unread_ns
+        if len(losses) > self._losses:
+            self._unread_ns = max(self._unread_ns, *(one.end_ns for one in losses[self._losses :]))
+            self._losses = len(losses)
+        return self._lights_at is not None and self._lights_at <= self._unread_ns
 
     def _take_controls(self, channel: int, log_time: int, data: memoryview) -> None:
         told = self._fields[channel].read(data)[1][0]
