@@ -14,11 +14,12 @@ from matplotlib.collections import EllipseCollection
 
 import sgstore.draw._page as layers
 import sgstore.draw._palette as palette
+from sgstore.base.display import number_of
 from sgstore.draw._ground import GroundView, paint_compass, paint_ground, paint_scale, rings_of
 from sgstore.draw._legend import Entry, ground_entries
 from sgstore.draw._panel import Panel, paint_legend
 from sgstore.draw._placement import Placer
-from sgstore.draw._view import MapWindow, clean, counted
+from sgstore.draw._view import MapWindow, clean
 from sgstore.errors import ExportError
 from sgstore.model.vocabulary import ENTITY_KINDS, KINDS, MAP_KINDS, SIGNALS
 
@@ -157,7 +158,7 @@ def _paint_figures(panel: Panel, ground: GroundView) -> None:
     for lane_type, count in by_type.most_common(14):
         length = sum(float(nodes.length[r]) for r in lanes if nodes.lane_type[r] == lane_type)
         name = clean(lane_type, 20) or "(none given)"
-        panel.row((0.0, name), (90.0, counted(count, "lane")), (150.0, f"{length / 1000:.2f} km"))
+        panel.row((0.0, name), (90.0, number_of(count, "lane")), (150.0, f"{length / 1000:.2f} km"))
 
 
 def _summary(ground: GroundView) -> str:
@@ -165,6 +166,9 @@ def _summary(ground: GroundView) -> str:
     low_high = [ring for outline in ground.outlines for ring in rings_of(outline)]
     extent = np.ptp(np.concatenate(low_high), axis=0) if low_high else np.zeros(2)
     order = [kind for kind in (*MAP_KINDS, *ENTITY_KINDS) if kinds[kind] and kind != "off_road"]
-    told = [counted(kinds[kind], kind.replace("_", " ")) for kind in order]
+    told = [
+        number_of(kinds[kind], kind.replace("_", " "), "" if kind == "vegetation" else "s")
+        for kind in order
+    ]
     more = [f"and {len(told) - _TOLD} kinds more"] if len(told) > _TOLD else []
     return "  ·  ".join([f"{extent[0]:.0f} m by {extent[1]:.0f} m", *told[:_TOLD], *more])

@@ -17,10 +17,11 @@ import numpy as np
 from matplotlib.patches import FancyArrowPatch, Rectangle
 
 import sgstore.draw._palette as palette
+from sgstore.base.display import number_of
 from sgstore.draw._drawn_links import ALONG, RANK, ego_lane, linked
 from sgstore.draw._legend import Entry
 from sgstore.draw._placement import Placer
-from sgstore.draw._view import SCENERY, clean, counted, distance
+from sgstore.draw._view import SCENERY, clean, distance
 from sgstore.model.vocabulary import ENTITY_KINDS, PROXIMITY, SIGNALS
 
 if TYPE_CHECKING:
@@ -432,8 +433,8 @@ def paint_diagram(page: Page, box: Rect, scene: DrawnFrame, relations: Relations
     unwritten = _Diagram(page, box, scene, nodes, lines).paint()
     edges = sum(len(line.relations) + len(line.back) for line in lines)
     return (
-        f"shown: {len(nodes)} of {counted(len(graph.nodes), 'node')},"
-        f" {edges} of {counted(len(graph.edges), 'edge')}"
+        f"shown: {len(nodes)} of {number_of(len(graph.nodes), 'node')},"
+        f" {edges} of {number_of(len(graph.edges), 'edge')}"
         + (f" ({unwritten} without words)" if unwritten else "")
     )
 

@@ -16,7 +16,8 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
 
-from sgstore.draw._view import clean, counted, number, view_of
+from sgstore.base.display import number_of
+from sgstore.draw._view import clean, number, view_of
 from sgstore.errors import ExportError, MissingExtraError
 from sgstore.model.world import seconds_of
 
@@ -266,10 +267,10 @@ def _subtitle(scene: DrawnFrame, unnamed: int) -> str:
         f"seen from above, {'ego heading' if turned_to_ego else 'north'} up",
         "" if ego else "no ego in this frame",
         "" if math.isnan(speed) else f"ego at {speed:.1f} m/s ({3.6 * speed:.0f} km/h)",
-        f"scene graph: {counted(len(graph.nodes), 'node')}, {counted(len(graph.edges), 'edge')}",
+        f"scene graph: {number_of(len(graph.nodes), 'node')}, {number_of(len(graph.edges), 'edge')}",
         "no road map" if scene.ground is None else "",
-        f"without a place, not drawn: {counted(scene.lost, 'node')}" if scene.lost else "",
-        f"{counted(unnamed, 'name')} left out for lack of room" if unnamed else "",
+        f"without a place, not drawn: {number_of(scene.lost, 'node')}" if scene.lost else "",
+        f"{number_of(unnamed, 'name')} left out for lack of room" if unnamed else "",
     ]
     return "  ·  ".join(text for text in told if text)
 

@@ -116,15 +116,6 @@ def clean(text: object, length: int = TEXT_LENGTH) -> str:
     return shown if len(shown) <= length else shown[: length - 1] + "…"
 
 
-def counted(number: int, thing: str) -> str:
-    """Return a count with its noun, such as ``2 frames``.
-
-    >>> counted(1, "lane"), counted(2000, "lane"), counted(2, "vegetation")
-    ('1 lane', '2,000 lanes', '2 vegetation')
-    """
-    return f"{number:,} {thing}{'' if number == 1 or thing == 'vegetation' else 's'}"
-
-
 CALLED: Final = "called"
 """Name of the node attribute with the label, in a graph to be drawn."""
 
