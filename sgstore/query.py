@@ -18,6 +18,7 @@ from sgstore.matches import UnionMatches
 from sgstore.model.criticality import KNOWN
 from sgstore.model.scope import scope_of
 from sgstore.model.vocabulary import normalize_name
+from sgstore.model.world import seconds_of
 from sgstore.store import FrameRef, StoreFile, UserTables, measured
 
 if TYPE_CHECKING:
@@ -1685,17 +1686,14 @@ class Store(StoreVerbs):
         """Return a frame for evaluation in memory, with the frame and trace attributes that the query needs."""
         from sgstore.lang.help import events_in, looked_up
         from sgstore.lang.memory import FrameView
-        from sgstore.model.world import seconds_of
 
         trace = self.file.trace(frame.trace_id)
         about = {f.name: getattr(frame, f.name) for f in fields(frame)} | {"id": frame.frame_id}
         if asked := looked_up(query):
             rows = self.file.rows(about_frame(asked), [frame.frame_id])
             about |= {one.attribute.name: v for one, v in zip(asked, rows.values[0], strict=True)}
-        whole = {f.name: getattr(trace, f.name) for f in fields(trace)}
-        whole |= {"id": trace.trace_id, "uri": place_named(trace.path), "ego": trace.ego or None}
-        whole |= {"map": trace.map or None, "period": seconds_of(trace.period_ns)}
-        whole |= {"duration": seconds_of(trace.end_ns - trace.start_ns)}
+        whole = trace_attributes({f.name: getattr(trace, f.name) for f in fields(trace)})
+        whole |= {"uri": place_named(trace.path)}
         classes = partial(self.file.abstracted.class_of, frame.frame_id)
         roles = partial(self.file.abstracted.roles_of, frame.frame_id)
         drawn = self.file.graph(frame.frame_id)
@@ -1710,6 +1708,29 @@ class Store(StoreVerbs):
         later = partial(measured, self.file.rows, frame.trace_id, scope)
         drawn = drawn if query.world else None
         return FrameView(graph, about, whole, classes, roles, events, later, drawn)
+
+
+def trace_attributes(columns: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the attributes of a trace for conditions in memory.
+
+    Parameters
+    ----------
+    columns : mapping
+        Stored columns of the trace: ``name``, ``trace_id``, ``ego``, ``map``, ``period_ns``, and others.
+
+    Returns
+    -------
+    dict
+        The columns, and the attributes that differ from them.
+    """
+    return {
+        **columns,
+        "id": columns["trace_id"],
+        "ego": columns["ego"] or None,
+        "map": columns["map"] or None,
+        "period": seconds_of(columns["period_ns"]),
+        "duration": seconds_of(columns["end_ns"] - columns["start_ns"]),
+    }
 
 
 def matches_of(

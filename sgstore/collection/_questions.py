@@ -46,7 +46,7 @@ from sgstore.matches import UnionMatches
 from sgstore.model.frame_ids import SEQ_BITS, trace_of
 from sgstore.model.graph import SceneGraph
 from sgstore.model.vocabulary import natural
-from sgstore.query import Store, StoreVerbs, matches_of
+from sgstore.query import Store, StoreVerbs, matches_of, trace_attributes
 from sgstore.store import (
     Example,
     FrameRef,
@@ -638,9 +638,7 @@ class CollectionMatches(TemporalMatches):
         tests = [expression(one, injective=False) for one in known]
         found: set[str] = set()
         for row in self.snapshot.traces:
-            about = {name: row[name] for name in ("name", "ego", "frames", "map")}
-            about |= {"id": row["trace_id"], "period": row["period_ns"] / 1e9}
-            about["duration"] = (row["end_ns"] - row["start_ns"]) / 1e9
+            about = trace_attributes(row)
             at = Binding(FrameView(SceneGraph(0, "", 0, 0, None, {}, []), trace=about))
             if all(test(at) is True for test in tests):
                 found.add(row["name"])
