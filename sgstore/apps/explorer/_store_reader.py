@@ -24,7 +24,6 @@ from sgstore.store import StateColumns
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from sgstore.lang.catalog import Catalog
     from sgstore.maps.roads import RoadMap
     from sgstore.model.graph import SceneGraph
     from sgstore.query import Store
@@ -64,7 +63,7 @@ class Reads:
 
     def __init__(self, store: Store) -> None:
         self._store = store
-        self._known: tuple[Catalog, dict[str, StoredTrace], dict[str, Any]] | None = None
+        self._known: tuple[dict[str, StoredTrace], dict[str, Any]] | None = None
         self._maps: dict[str, bytes] = {}
         self._reading, self._looking = threading.Lock(), threading.Lock()
 
@@ -72,14 +71,11 @@ class Reads:
         """Return the traces of the store by name, and its description for the page. Both are cached."""
         with self._looking:  # after a change one thread reads, and the others wait
             stamp = self._store.file.stamp
-            catalog = self._store.catalog()
-            known = self._known
-            # The file may have changed between its stamp and its catalog.
-            if known is None or known[0] is not catalog or known[2]["stamp"] != stamp:
+            if self._known is None or self._known[1]["stamp"] != stamp:
                 with self._store.file.snapshot():
                     traces = {one.name: one for one in self._store.traces()}
-                    self._known = catalog, traces, self._told(traces) | {"stamp": stamp}
-            return self._known[1], self._known[2]
+                    self._known = traces, self._told(traces) | {"stamp": stamp}
+            return self._known
 
     def _told(self, traces: dict[str, StoredTrace]) -> dict[str, Any]:
         file, places = self._store.file, StateColumns(self._store.file).places()
