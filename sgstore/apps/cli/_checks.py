@@ -233,7 +233,7 @@ def _reported(
 
     ``failing``: the verdicts that change the exit code.
     """
-    from sgstore.temporal import columns_returned, verdict_columns, verdict_rows
+    from sgstore.temporal import absence_text, columns_returned, verdict_columns, verdict_rows
 
     if explain:
         typer.echo(run.explain())
@@ -272,7 +272,7 @@ def _reported(
         ask.write((*_DOCUMENT, *more), told)
     say_unknown((one.check, one.trace, one.reason) for one in kept)
     for one, frames in absent.items():
-        say(f"{one} is true, and an entity is absent in {frames} frame{'s' * (frames != 1)}")
+        say(f"{one} is true, and {absence_text(frames)}")
     files.write(kept)
     code = NO_MATCH if any(tally.get(word) for word in failing) else 0
     if not code and ask.for_people and not files:

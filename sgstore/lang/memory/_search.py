@@ -153,7 +153,7 @@ class ScopeSearch:
             yield from self._name(at, number, 0)
 
     def _name(self, at: Binding, number: int, nth: int) -> Iterator[None]:
-        """Choose the edges of a step that have names or conditions, then go on. Yield once per match."""
+        """Choose the edges that a step tests or names, then match the later steps. Yield once per match."""
         step = self._steps[number]
         if nth == len(step.named):
             yield from self._bind(at, number + 1)
