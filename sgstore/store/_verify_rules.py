@@ -11,6 +11,13 @@ from sgstore.store._columns import REPEATED, STATES
 from sgstore.store._packing import LONGEST_STEP
 from sgstore.store._publish import SHARED
 
+_MASKS: Final[tuple[tuple[str, str], ...]] = (
+    *(("edge", "an edge holds"), ("world_edge", "an edge holds")),
+    *(("node", "a static node is present"), ("world_node", "a static node is present")),
+    *((table, f"a row of {table} is") for table in REPEATED.values()),
+)
+"""Table with a bit mask of frames, and the words for one of its rows."""
+
 RULES: Final[tuple[tuple[str, str, str], ...]] = (
     *(
         (
@@ -20,21 +27,7 @@ RULES: Final[tuple[tuple[str, str, str], ...]] = (
             SELECT r.bucket >> 18 FROM {table} r LEFT JOIN bucket b ON b.bucket = r.bucket
             WHERE b.bucket IS NULL OR r.mask = 0 OR (r.mask & ~b.valid) <> 0""",
         )
-        for what, tables in (
-            ("an edge holds", ("edge", "world_edge")),
-            ("a static node is present", ("node", "world_node")),
-        )
-        for table in tables
-    ),
-    *(
-        (
-            "masks",
-            f"a row of {table} is of no frame, or of frames that the trace does not have",
-            f"""
-            SELECT r.bucket >> 18 FROM {table} r LEFT JOIN bucket b ON b.bucket = r.bucket
-            WHERE b.bucket IS NULL OR r.mask = 0 OR (r.mask & ~b.valid) <> 0""",
-        )
-        for table in REPEATED.values()
+        for table, what in _MASKS
     ),
     (
         "masks",

@@ -150,7 +150,8 @@ def _window(e: s.Call, names: SymbolTable) -> b.SignalCall:
         by, ahead = length(window.before, names), length(window.ahead, names)
         if by.frames != ahead.frames:
             names.session.refuse("a window must be in time or in frames, not both", window.span)
-        by = replace(by, amount=by.amount + by.frames)
+        if by.frames:  # -2frames..2frames has five frames: two before, its own, and two ahead
+            by = replace(by, amount=by.amount + 1)
     else:
         by = _how_far(e, names)
     if by.frames and not by.amount:
