@@ -257,12 +257,14 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> None:
 
 def violations_text(verdict: Verdict) -> str:
     """Return the violations of a check as text, one line each, with their entities."""
+    from sgstore.temporal import false_text
+
     lines = [f"{verdict.trace} violates {verdict.check}"]
     for one in verdict.violations:
         who = ", ".join(map(str, one.values.values()))
         lines.append(
             f"  #{one.start_seq}-{one.end_seq}, {one.start:.3f} to {one.end:.3f} s,"
-            f" {number_of(one.frames, 'frame')}" + f": {who}" * bool(who)
+            f" {number_of(one.frames, 'frame')}{false_text(one)}" + f": {who}" * bool(who)
         )
     return "\n".join(lines)
 

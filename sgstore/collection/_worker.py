@@ -28,10 +28,17 @@ from sgstore.lang.topics import NoTopicError, topics_of_parts
 from sgstore.matches import Interval, UnionMatches
 from sgstore.query import Store, UserStatement, matches_of
 from sgstore.store import Example, PartFile, StoreFile, UserTables
-from sgstore.temporal import CheckRun, Robustness, TemporalMatches, Verdict, Witness
+from sgstore.temporal import (
+    CheckRun,
+    Robustness,
+    TemporalMatches,
+    Verdict,
+    ViolationInterval,
+    Witness,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterator, Mapping
+    from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 
     from sgstore.lang.catalog import Catalog
     from sgstore.matches import Matches
@@ -216,13 +223,22 @@ def _getter(kind: type) -> Callable[[Any], tuple[Any, ...]]:
 _of_interval, _of_robustness = _getter(Interval), _getter(Robustness)
 
 
+def _of_violation(one: ViolationInterval) -> tuple[Any, ...]:
+    return *_of_interval(one), [*map(_of_interval, one.false_runs)]
+
+
+def _as_violation(values: Sequence[Any]) -> ViolationInterval:
+    *about, runs = values
+    return ViolationInterval(*about, tuple(Interval(*run) for run in runs))
+
+
 def _values_of(verdict: Verdict) -> list[Any]:
     """Return a verdict as a list of values. A dict would be three times as long."""
     margin, witnesses = verdict.robustness, verdict.witnesses
     return [
         *(verdict.check, verdict.trace, verdict.verdict),
-        [*map(_of_interval, verdict.violations)],
-        [(w.nodes, w.names, w.holds, [*map(_of_interval, w.violations)]) for w in witnesses],
+        [*map(_of_violation, verdict.violations)],
+        [(w.nodes, w.names, w.holds, [*map(_of_violation, w.violations)]) for w in witnesses],
         *(verdict.status, verdict.reason),
         None if margin is None else _of_robustness(margin),
         verdict.absent_frames,
@@ -238,9 +254,9 @@ def as_verdict(values: list[Any]) -> Verdict:
         check,
         trace,
         word,
-        tuple(Interval(*one) for one in violations),
+        tuple(map(_as_violation, violations)),
         tuple(
-            Witness(nodes, names, holds, tuple(Interval(*one) for one in some))
+            Witness(nodes, names, holds, tuple(map(_as_violation, some)))
             for nodes, names, holds, some in witnesses
         ),
         None if status is None else np.array(status, np.int8),

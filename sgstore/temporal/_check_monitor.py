@@ -15,10 +15,14 @@ from weakref import WeakValueDictionary
 import numpy as np
 
 from sgstore.errors import QueryError
-from sgstore.matches import Interval
 from sgstore.temporal._binding_truth import Valuation
 from sgstore.temporal._check_plan import FAVOURABLE, SIGNS, UNFAVOURABLE, base_name, plan_of_check
-from sgstore.temporal._check_verdict import Verdict, doubt_text, verdict_of
+from sgstore.temporal._check_verdict import (
+    Verdict,
+    ViolationInterval,
+    doubt_text,
+    verdict_of,
+)
 from sgstore.temporal._formula import TRUE, And, Formula, Since, looks_ahead, propositions
 from sgstore.temporal._match_values import AT_FRAME, ReturnedValues
 from sgstore.temporal._match_values_monitor import MatchValues
@@ -772,7 +776,7 @@ class CheckMonitor:
             word = "pending" if self._waits(levels) else "false"
         spans = [self._spans(entry, last) for entry in entries]
 
-        def violations(row: int, names: Mapping[str, str]) -> tuple[Interval, ...]:
+        def violations(row: int, names: Mapping[str, str]) -> tuple[ViolationInterval, ...]:
             key = tuple(bindings[row].tolist())
             return tuple(
                 _interval(trace, span, {**names, **values})
@@ -859,7 +863,8 @@ def _code(entry: _CheckEntry, *, compat: bool) -> int:
     return PRESUMABLY_TRUE if entry.state.ended else PRESUMABLY_FALSE
 
 
-def _interval(trace: str, span: Span, values: Mapping[str, Any]) -> Interval:
+def _interval(trace: str, span: Span, values: Mapping[str, Any]) -> ViolationInterval:
     start, end = span
     times = start.time_ns, end.time_ns, start.t, end.t
-    return Interval(trace, start.seq, end.seq, *times, end.seq - start.seq + 1, dict(values))
+    frames = end.seq - start.seq + 1
+    return ViolationInterval(trace, start.seq, end.seq, *times, frames, dict(values))

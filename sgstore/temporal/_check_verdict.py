@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.base.display import IN_NOTEBOOK
+from sgstore.base.display import IN_NOTEBOOK, number_of
 from sgstore.lang.sql import value_text
+from sgstore.matches import Interval
 from sgstore.temporal._quantifiers import HOLDS, VIOLATED, Level, folded_values
 from sgstore.temporal._verdicts import STATUS
 
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sgstore.lang.ir import Bound, BoundCheck
-    from sgstore.matches import Interval
     from sgstore.temporal._known_range import ShortRange
     from sgstore.temporal._robustness import Robustness
 
@@ -28,6 +28,28 @@ if TYPE_CHECKING:
     Keys = NDArray[np.int64]
     Statuses = NDArray[np.int8]
     Array = NDArray[Any]
+
+
+@dataclass(frozen=True, slots=True)
+class ViolationInterval(Interval):
+    """Frames of a violation, from the frame in which it is certain.
+
+    Attributes
+    ----------
+    false_runs : tuple of Interval
+        For a check ``ALWAYS p``: the runs of frames in which p is false, up to the end of the violation. The
+        first run begins where the violated obligation began. Other checks, monitors and the SGSM mode have
+        none.
+
+    Examples
+    --------
+    >>> text = "CHECK brakes: ALWAYS (ego.speed > 10 IMPLIES EVENTUALLY[0s, 5s] ego.speed < 8)"
+    >>> violation = next(iter(store.check(text))).first_violation
+    >>> violation.start, [(run.start, run.end, run.frames) for run in violation.false_runs]
+    (5.1, [(0.0, 0.5, 6), (7.9, 8.8, 10), (12.5, 13.9, 15), (44.8, 44.8, 1)])
+    """
+
+    false_runs: tuple[Interval, ...] = field(default=(), compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,14 +63,14 @@ class Witness:
     names : dict of str to str
         Entity names by variable.
     holds : bool
-    violations : tuple of Interval
+    violations : tuple of ViolationInterval
         Violations of the check by these entities.
     """
 
     nodes: Mapping[str, int]
     names: Mapping[str, str]
     holds: bool
-    violations: tuple[Interval, ...]
+    violations: tuple[ViolationInterval, ...]
 
 
 def unknown_notes(told: Iterable[tuple[str, str, str]]) -> list[str]:
@@ -81,6 +103,15 @@ def doubt_text(condition: Bound, who: Sequence[str], frame: str) -> str:
     return f"{written} is unknown{' of ' * bool(who)}{', '.join(who)} in {frame}"
 
 
+def false_text(violation: ViolationInterval) -> str:
+    """Return a text such as "; condition false from 8.400 to 12.250 s, in 78 frames", or an empty text."""
+    runs = violation.false_runs
+    if not runs:
+        return ""
+    frames = number_of(sum(run.frames for run in runs), "frame")
+    return f"; condition false from {runs[0].start:.3f} to {runs[-1].end:.3f} s, in {frames}"
+
+
 def absence_text(frames: int) -> str:
     """Return the text "an entity is absent in N frames"."""
     return f"an entity is absent in {frames} frame{'s' * (frames != 1)}"
@@ -97,9 +128,9 @@ class Verdict:
     verdict : str
         ``true`` or ``false``, if independent of unknown values; ``pending``, if an obligation is open at the
         end of the recording; else ``unknown``.
-    first_violation : Interval or None
+    first_violation : ViolationInterval or None
         First violation, or ``None``.
-    violations : tuple of Interval
+    violations : tuple of ViolationInterval
         Violations in order; with quantifiers, the violations of all witnesses.
     witnesses : tuple of Witness
     status : (F,) int8 or None
@@ -121,7 +152,7 @@ class Verdict:
     check: str
     trace: str
     verdict: str
-    violations: tuple[Interval, ...] = ()
+    violations: tuple[ViolationInterval, ...] = ()
     witnesses: tuple[Witness, ...] = ()
     status: Statuses | None = None
     reason: str = ""
@@ -147,7 +178,7 @@ class Verdict:
         return html_table(verdict_columns(margin=margin), rows[:IN_NOTEBOOK], below=below)
 
     @property
-    def first_violation(self) -> Interval | None:
+    def first_violation(self) -> ViolationInterval | None:
         """First violation of the check in the trace, or ``None``.
 
         Examples
@@ -182,7 +213,8 @@ class Verdict:
         return tuple(STATUS[code] for code in self.status) if self.status is not None else ()
 
 
-_COLUMNS: Final = ("check", "trace", "verdict", "who", "from", "start", "end", "frames")
+_SPAN: Final = ("from", "start", "end", "frames", "false from", "false to", "false frames")
+_COLUMNS: Final = ("check", "trace", "verdict", "who", *_SPAN)
 
 _MARGIN_COLUMNS: Final = ("robustness", "decided by", "in")
 
@@ -223,7 +255,7 @@ def verdict_rows(
     """
     head = verdict.check, verdict.trace, verdict.verdict
     tail = margin_cells(verdict) if margin else ()
-    nothing = [("",) * (4 + len(returned))]
+    nothing = [("",) * (len(_SPAN) + len(returned))]
     told = False
     for witness in verdict.witnesses:
         who = ", ".join(witness.names.values())
@@ -249,17 +281,27 @@ def margin_cells(verdict: Verdict) -> tuple[str, str, str]:
     return f"{found.value:.4g}", decided, frame
 
 
-def _times(violations: tuple[Interval, ...], returned: Sequence[str]) -> list[tuple[Any, ...]]:
+def _times(
+    violations: tuple[ViolationInterval, ...], returned: Sequence[str]
+) -> list[tuple[Any, ...]]:
     return [
         (
             f"{i.trace}#{i.start_seq}",
             round(i.start, 3),
             round(i.end, 3),
             i.frames,
+            *_false_cells(i.false_runs),
             *(cell_of(i.values.get(name, "")) for name in returned),
         )
         for i in violations
     ]
+
+
+def _false_cells(runs: tuple[Interval, ...]) -> tuple[Any, ...]:
+    """Return three table cells: first and last time (s) at which the condition is false, and the frames."""
+    if not runs:
+        return "", "", ""
+    return round(runs[0].start, 3), round(runs[-1].end, 3), sum(run.frames for run in runs)
 
 
 def returned_by(checks: Iterable[BoundCheck]) -> dict[str, tuple[str, ...]]:
@@ -279,14 +321,28 @@ def cell_of(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
+def _united(runs: Iterable[Interval]) -> tuple[Interval, ...]:
+    """Return runs of frames without overlaps, in order."""
+    found: list[Interval] = []
+    for run in sorted(runs, key=lambda run: (run.start_seq, run.end_seq)):
+        if found and run.start_seq <= found[-1].end_seq + 1:
+            first, last = found[-1], max(found.pop(), run, key=lambda one: one.end_seq)
+            frames = first.frames + last.end_seq - first.end_seq
+            end = {"end_seq": last.end_seq, "end_ns": last.end_ns, "end": last.end}
+            found.append(replace(first, frames=frames, **end))
+        else:
+            found.append(run)
+    return tuple(found)
+
+
 def verdict_of(
     check: BoundCheck,
     verdict: Verdict,
     levels: Sequence[Level],
     codes: Codes,
     names: Mapping[str, Mapping[int, str]],
-    violations: Callable[[int, Mapping[str, str]], tuple[Interval, ...]],
-    last: Interval,
+    violations: Callable[[int, Mapping[str, str]], tuple[ViolationInterval, ...]],
+    last: ViolationInterval,
 ) -> Verdict:
     """Return a copy of a verdict, completed by its violations and by the entities that decide it.
 
@@ -303,7 +359,7 @@ def verdict_of(
         Variable → names of its possible entities.
     violations : function
         Function from the row of a last-level binding and its entity names to its violations.
-    last : Interval
+    last : ViolationInterval
         Last frame: the violation if no binding has one.
     """
     if not levels:
@@ -319,9 +375,13 @@ def verdict_of(
         called = {name: names[name][node] for name, node in nodes.items()}
         inner = violations(row, called) if depth == len(levels) else ()
         found.append(Witness(nodes, called, bool(values[row] == HOLDS), inner))
-    told: tuple[Interval, ...] = ()
+    told: tuple[ViolationInterval, ...] = ()
     if folded[0][0] == VIOLATED:
-        every = {(i.start_seq, i.end_seq): i for w in found for i in w.violations}
+        every: dict[tuple[int, int], ViolationInterval] = {}
+        for one in (i for w in found for i in w.violations):
+            other = every.get((one.start_seq, one.end_seq), one)
+            runs = _united((*one.false_runs, *other.false_runs))
+            every[one.start_seq, one.end_seq] = replace(one, false_runs=runs)
         told = tuple(every[key] for key in sorted(every))
         if not told and check.having is None:
             told = (last,)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from heapq import merge
 from itertools import islice
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -36,6 +36,7 @@ from sgstore.temporal._check_plan import (
 )
 from sgstore.temporal._check_verdict import (
     Verdict,
+    ViolationInterval,
     columns_returned,
     doubt_text,
     returned_by,
@@ -329,7 +330,7 @@ class Judged:
     ----------
     codes : (B,) int8
         From :data:`VIOLATED` to :data:`HOLDS`.
-    told : list of (violations, status)
+    told : list of (violations, status, false frames)
     in_gap : (B,) bool
         True if the verdict depends on events in a gap.
     """
@@ -339,8 +340,12 @@ class Judged:
     in_gap: Bools
 
 
-_BindingVerdict = tuple[tuple[Violation, ...], "Statuses | None"]
-"""Violations of one binding (combination of entities), and its status after each frame if requested."""
+_BindingVerdict = tuple[tuple[Violation, ...], "Statuses | None", "Bools | None"]
+"""Violations of one binding (combination of entities), and its status after each frame if requested.
+
+Third: the frames in which the condition of an ``ALWAYS`` check is false."""
+
+_NOTHING: Final[_BindingVerdict] = (), None, None
 
 
 class StoreCheck:
@@ -573,7 +578,7 @@ class StoreCheck:
         """Return the verdict for each combination of entities of a check in a trace."""
         kinds, members = self._alike(trace, innermost(levels))
         codes = np.zeros(len(kinds), np.int8)
-        told: list[_BindingVerdict] = [((), None)] * len(kinds)
+        told = [_NOTHING] * len(kinds)
         gaps = self._check.gaps == "unknown" and bool(trace.clock.gap_before.any())
         in_gap = np.zeros(len(kinds), np.bool_)
         for low in range(0, len(kinds), trace.together):
@@ -825,14 +830,14 @@ class StoreCheck:
         truths = values.formula(self._formula)[:, 0]
         resets = values.formula(self._reset) if self._reset is not None else None
         codes = np.where(truths, HOLDS, VIOLATED).astype(np.int8)
-        told: list[_BindingVerdict] = [((), None)] * rows
+        told = [_NOTHING] * rows
         lenient = tolerant(self._formula, trace.clock.tolerance)
         kept = always_true(self._formula)
         if kept is not None and not (looks_ahead(kept) or self._compat or self._want_status):
             held = values.formula(kept)
             for row in np.flatnonzero(~truths if among is None else ~truths & among).tolist():
                 reset = None if resets is None else resets[row]
-                told[row] = tuple(violations_of_always(held[row], reset)), None
+                told[row] = tuple(violations_of_always(held[row], reset)), None, ~held[row]
             return codes, told
         for row in range(rows):
             needed = not truths[row] or self._compat or self._want_status
@@ -848,10 +853,11 @@ class StoreCheck:
         status = settled.statuses() if self._compat or self._want_status else None
         if self._compat and status is not None:
             broken = status < PRESUMABLY_TRUE
-            return VIOLATED if broken.any() else HOLDS, (tuple(_runs(broken)), status)
+            return VIOLATED if broken.any() else HOLDS, (tuple(_runs(broken)), status, None)
         violations, due = settled.judged(reset, self._check.end)
         code = VIOLATED if violations else PENDING if due else HOLDS
-        return code, (tuple(violations), status)
+        false = settled.false_frames(self._check.end) if violations else None
+        return code, (tuple(violations), status, false)
 
     def _reported(
         self, trace: TraceReader, word: str, about: tuple[Sequence[Level], Judged]
@@ -860,17 +866,18 @@ class StoreCheck:
         status = self._joined(levels, judged.told, len(trace))
         bindings = innermost(levels)
 
-        def violations(row: int, names: Mapping[str, str]) -> tuple[Interval, ...]:
-            spans = judged.told[row][0] if judged.codes[row] == VIOLATED else ()
+        def violations(row: int, names: Mapping[str, str]) -> tuple[ViolationInterval, ...]:
+            spans, _, false = judged.told[row] if judged.codes[row] == VIOLATED else _NOTHING
             values = self._values_of(trace, bindings[row : row + 1], spans)
+            begins = [0, *(end + 1 for _, end, _ in spans)]
             return tuple(
-                _interval(trace, one, {**names, **more})
-                for one, more in zip(spans, values, strict=True)
+                _violation(trace, one, {**names, **more}, _false_runs(trace, false, begin, one[1]))
+                for begin, one, more in zip(begins, spans, values, strict=False)
                 if more is not None
             )
 
         names = self._people.get(trace.trace_id, {})
-        last = _interval(trace, (len(trace) - 1, len(trace) - 1, True), {})
+        last = _violation(trace, (len(trace) - 1, len(trace) - 1, True), {})
         found = Verdict(self._check.name, trace.name, word, status=status)
         return verdict_of(self._check, found, levels, judged.codes, names, violations, last)
 
@@ -902,7 +909,7 @@ class StoreCheck:
         """Return the check's status after each frame, combined from the status of each entity combination."""
         if not self._want_status:
             return None
-        rows = [status for _, status in told if status is not None]
+        rows = [status for _, status, _ in told if status is not None]
         codes = np.array(rows, np.int8).reshape(len(rows), frames)
         return folded_values(levels, codes, CERTAINLY_TRUE)[0][0]
 
@@ -913,9 +920,25 @@ def _runs(flags: Bools) -> Iterator[Violation]:
         yield start, end - 1, False
 
 
-def _interval(trace: TraceReader, of: Violation, values: Mapping[str, Any]) -> Interval:
+def _false_runs(
+    trace: TraceReader, false: Bools | None, first: int, last: int
+) -> tuple[Interval, ...]:
+    """Return the runs of false frames between two frames, both included."""
+    if false is None:
+        return ()
+    runs = _runs(false[first : last + 1])
+    return tuple(Interval(*_extent(trace, first + a, first + b), {}) for a, b, _ in runs)
+
+
+def _violation(
+    trace: TraceReader, of: Violation, values: Mapping[str, Any], runs: tuple[Interval, ...] = ()
+) -> ViolationInterval:
     start, end, _ = of
+    return ViolationInterval(*_extent(trace, start, end), dict(values), runs)
+
+
+def _extent(trace: TraceReader, start: int, end: int) -> tuple[Any, ...]:
+    """Return the fields of an interval before its values."""
     (first, last), (begin, stop) = trace.numbers[[start, end]], trace.times[[start, end]]
     seqs_ns = int(first), int(last), int(begin), int(stop)
-    seconds = trace.seconds(start), trace.seconds(end)
-    return Interval(trace.name, *seqs_ns, *seconds, end - start + 1, dict(values))
+    return trace.name, *seqs_ns, trace.seconds(start), trace.seconds(end), end - start + 1

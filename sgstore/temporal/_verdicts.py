@@ -260,6 +260,25 @@ class Settled:
             return True
         return end == "bounded" and int(self._missed[start]) >= self._frames
 
+    def false_frames(self, end: str) -> Bools | None:
+        """Return a mask of the frames in which the condition of an ``ALWAYS`` formula is false.
+
+        ``None`` means another formula.
+
+        Parameters
+        ----------
+        end : str
+            See :attr:`~sgstore.lang.ir.BoundCheck.end`. A condition that is open at the trace end counts as
+            false only if it counts as failed.
+        """
+        body = required_throughout(self.formula)
+        if body is None:
+            return None
+        if end == "strong":
+            return ~self._table.whole(body)
+        ended = self._tolerance if end == "bounded" else None
+        return known(body, self._table, ended=ended)[1] < self._frames
+
     def statuses(self) -> NDArray[np.int8]:
         """Return the status of the formula after each frame, as an index in :data:`STATUS`."""
         try:
@@ -415,6 +434,14 @@ def always_true(formula: Formula) -> Formula | None:
             return right.operand if isinstance(right, Not) else Not(right)
         case _:
             return None
+
+
+def required_throughout(formula: Formula) -> Formula | None:
+    """Return the condition that a formula requires in every frame; ``None`` if it is not such a formula."""
+    if not isinstance(formula, And):
+        return always_true(formula)
+    bodies = [one for one in map(required_throughout, formula.operands) if one is not None]
+    return And(tuple(bodies)) if len(bodies) == len(formula.operands) else None
 
 
 def bounded(formula: Formula) -> bool:

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from sgstore.collection import CollectionChecks
     from sgstore.matches import Interval
     from sgstore.query import Store
-    from sgstore.temporal import CheckRun, Verdict
+    from sgstore.temporal import CheckRun, Verdict, ViolationInterval
 
 PANEL: Final = "Rules over time"
 
@@ -331,9 +331,13 @@ def margin_document(verdict: Verdict) -> dict[str, Any] | None:
     return asdict(found) | {k: v if math.isfinite(v) else None for k, v in ends.items()}
 
 
-def _span(interval: Interval, returned: Sequence[str]) -> dict[str, Any]:
+def _extent(interval: Interval) -> dict[str, Any]:
     names = ("start_seq", "end_seq", "start_ns", "end_ns", "start", "end", "frames")
-    about = {name: getattr(interval, name) for name in names}
+    return {name: getattr(interval, name) for name in names}
+
+
+def _span(interval: ViolationInterval, returned: Sequence[str]) -> dict[str, Any]:
+    about = _extent(interval) | {"false_runs": [*map(_extent, interval.false_runs)]}
     if returned:
         about["values"] = {name: interval.values.get(name) for name in returned}
     return about

@@ -102,10 +102,12 @@ def _word(verdict: Verdict) -> str:
 
 def _violations(verdict: Verdict, evidence: Evidence) -> list[str]:
     """Return a text line for each violation of a check: its frames, times, values and evidence."""
+    from sgstore.temporal import false_text
+
     return [
         _plain(
             f"{one.trace}#{one.start_seq}-{one.end_seq}, {one.start:.3f} to {one.end:.3f} s,"
-            f" {number_of(one.frames, 'frame')}"
+            f" {number_of(one.frames, 'frame')}{false_text(one)}"
             + "".join(f", {name} {value}" for name, value in one.values.items())
             + "".join(f"; {name}: {value}" for name, value in evidence.of(one).items())
         )

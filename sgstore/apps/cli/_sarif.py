@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from sgstore.apps.cli._junit import Evidence
-    from sgstore.temporal import Verdict
+    from sgstore.temporal import Verdict, ViolationInterval
 
 _SCHEMA: Final = "https://json.schemastore.org/sarif-2.1.0.json"
 _PACKAGE: Final = "https://pypi.org/project/sgstore/"
@@ -58,7 +58,7 @@ def write_sarif(
             {
                 "ruleId": one.check,
                 "level": "error",
-                "message": {"text": f"{span.trace}, {span.start:.3f} to {span.end:.3f} s"},
+                "message": {"text": _message(span)},
                 "locations": [_location(span.trace, recordings.get(span.trace, span.trace))],
                 "partialFingerprints": {"violation": f"{one.check}/{span.trace}#{span.start_seq}"},
                 "properties": {
@@ -85,6 +85,12 @@ def write_sarif(
     }
     document = {"$schema": _SCHEMA, "version": "2.1.0", "runs": [run]}
     write_bytes(path, json.dumps(document, indent=1).encode() + b"\n")
+
+
+def _message(span: ViolationInterval) -> str:
+    from sgstore.temporal import false_text
+
+    return f"{span.trace}, {span.start:.3f} to {span.end:.3f} s{false_text(span)}"
 
 
 def _address() -> str:
