@@ -207,6 +207,15 @@ def test_misspelt_option_has_a_suggestion(capsys: pytest.CaptureFixture[str]) ->
     assert "write: sgstore show x --verbose" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("option", ["--limit", "--top", "-n"])
+def test_command_without_limit_names_another_way(
+    capsys: pytest.CaptureFixture[str], option: str
+) -> None:
+    assert run(["check", "x.sgstore", "ALWAYS ego.speed < 3", option, "5"]) == 2
+    written = " ".join(capsys.readouterr().err.split())
+    assert f"No such option: {option}; check prints all rows; '| head' shows" in written
+
+
 def test_option_of_other_commands_names_them(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["show", "x", "y", "--graph", "--abstraction", "roadscene2vec"]) == 2
     written = " ".join(capsys.readouterr().err.split())

@@ -280,7 +280,12 @@ def _advise(error: Any, verb: Verb, ctx: Any, args: list[str]) -> None:
     name = getattr(error, "option_name", "")
     if type(error).__name__ == "NoSuchOption":
         error.possibilities = None
-        if line := _option_instead(verb, ctx, args, name):
+        known = _words_of(verb)
+        limits = "--limit", *_OPTIONS_OF_OTHERS["--limit"]
+        if name in limits and "--format" in known and "--limit" not in known:
+            every = f"{verb.name} prints all rows; '| head' shows the first, -o FILE writes all"
+            error.message = f"No such option: {name}; {every}"
+        elif line := _option_instead(verb, ctx, args, name):
             error.message = f"No such option: {name}; write: {line}"
         elif others := _commands_with(ctx.find_root().command, name):
             error.message = f"No such option: {name}; it is an option of: {', '.join(others)}"
