@@ -423,8 +423,8 @@ class StoreVerbs:
         Parameters
         ----------
         kind : str
-            ``classes``, ``growth``, ``combos``, ``sequences``, ``spec``; with ``by`` also ``of``, ``novel``,
-            ``venn``, ``explain``.
+            ``classes``, ``growth``, ``combos``, ``sequences``, ``spec``, ``iso34502``; with ``by`` also
+            ``of``, ``novel``, ``venn``, ``explain``.
         query : str
             Use the frames that match, by default all; with ``spec`` each combination of values is a cell.
         by : str, Path, Store or Collection

@@ -237,6 +237,8 @@ def coverage(  # noqa: PLR0913 - the options of the command
         return listed(of.slot_coverage(chosen, declared, how["k"] * (kind == "combos")), **asked)
     if kind == "spec":
         return listed(of.specification(chosen, query, how["cells"], *other), **asked)
+    if kind == "iso34502":
+        return listed(of.iso34502(chosen), **asked)
     if kind == "sequences":
         named, within = of.manoeuvres_named(how["manoeuvres"]), seconds(how["within"], "--within")
         found = of.sequences(chosen, how["k"], other[0] if other else None, named, within)
@@ -299,7 +301,7 @@ def class_tables(  # noqa: PLR0913 - the options of the commands
 
 
 _COMPARING: Final = ("of", "novel", "venn", "explain")
-KINDS: Final = ("classes", "growth", "combos", "sequences", "spec", *_COMPARING)
+KINDS: Final = ("classes", "growth", "combos", "sequences", "spec", "iso34502", *_COMPARING)
 """Kinds of coverage that can be measured."""
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 import commonroad_scenarios as commonroad
+import numpy as np
 import pytest
 from lanelet2_maps import LaneletMap
 from library_scenes import ENTRY, EXIT, SCENES, WAYS, on
@@ -19,8 +20,11 @@ from sgstore.maps.lanelet2 import lanelet2_text
 from sgstore.maps.map_files import read_map_file
 from sgstore.maps.opendrive import read_map
 from sgstore.maps.sumo_net import sumo_net_text
+from sgstore.model.frame_ids import SEQ_BITS
+from sgstore.pipeline.importing import import_graphs
 from sgstore.readers import open_trace
 from sgstore.temporal import Monitor
+from sgstore.testsets.coverage import ChosenFrames, iso34502, selection_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -97,6 +101,59 @@ def test_a_monitor_finds_it_where_the_store_does(store: Store, name: str, zone: 
         monitor.finish()
 
         assert ("found" in told) == (number % 2 == 0)
+
+
+def test_coverage_counts_each_disturbance_on_each_road(store: Store) -> None:
+    cells, covered, missing = iso34502(ChosenFrames("all", store))
+
+    assert len({(row["road"], row["ego"], row["other"]) for row in cells.dicts()}) == 24
+    of_trace: dict[str, dict[str, set[str]]] = {}
+    for row in cells.dicts():
+        name, _, zone = row["pattern"].partition(" zone=")
+        found = [*store.find(pattern_named(name).written(zone=zone)).intervals()]
+        of_trace.setdefault(zone, {})[name] = {one.trace for one in found}
+        assert (row["matches"], row["traces"]) == (len(found), len({one.trace for one in found}))
+        assert row["state"] == ("covered" if found else "missing")
+        assert row["unknown_traces"] == 0
+    for trace in TRACES:
+        zone, _, name = trace.partition(" ")
+        assert trace in of_trace[zone][name]
+    states = [row["state"] for row in cells.dicts()]
+    assert (len(covered.rows), len(missing.rows)) == (
+        states.count("covered"),
+        24 - len(covered.rows),
+    )
+
+
+def test_a_selected_frame_counts_the_matches_that_end_there(store: Store) -> None:
+    query = pattern_named(TRIED[0]).written(zone="merge")
+    (first, *_) = sorted((i.trace, i.end_seq) for i in store.find(query).intervals())
+    (trace,) = (one.trace_id for one in store.info() if one.name == first[0])
+    last = (trace << SEQ_BITS) + first[1]
+
+    for frame, matches in ((last, 1), (last - 1, 0)):
+        cells = iso34502(ChosenFrames("one", store, np.array([frame])))[0].dicts()
+        (row,) = (row for row in cells if row["pattern"] == f"{TRIED[0]} zone=merge")
+        assert (row["matches"], row["ego_frames"]) == (matches, 1)
+
+
+def test_a_cell_without_the_data_of_its_pattern_is_unknown_and_not_0(tmp_path: Path) -> None:
+    scene = SCENES["iso_cut_in"][0]
+    assert scene is not None
+    (tmp_path / "graph.csv").write_text("graph,src,relation,dst\na,ego,near,car_1\n")
+    import_graphs(tmp_path / "graph.db", [tmp_path / "graph.csv"], "csv")
+    beside = Scene(scene.road, ego(along(400), 5), seconds=2)
+    cells = iso34502(selection_of(str(tmp_path / "graph.db")))[0]
+    off = iso34502(ChosenFrames("off", store_of(tmp_path / "off.db", {"off": [beside]})))[0]
+    store_of(tmp_path / "graph.db", {"cut-in": [scene]})
+    partly = iso34502(selection_of(str(tmp_path / "graph.db")))[0]
+
+    assert {(row["state"], row["matches"]) for row in cells.dicts()} == {("unknown", None)}
+    assert [note.partition(":")[0] for note in cells.said[1:]] == ["graph is unknown"]
+    assert {(row["state"], row["matches"]) for row in off.dicts()} == {("unknown", None)}
+    assert off.said[1:] == ["off is unknown: the ego is on no lane of a map"]
+    assert {row["unknown_traces"] for row in partly.dicts()} == {1}
+    assert {row["state"] for row in partly.dicts()} == {"covered", "missing"}
 
 
 def test_another_zone_is_refused(store: Store) -> None:

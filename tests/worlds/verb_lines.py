@@ -55,6 +55,7 @@ LINES: dict[str, list[str]] = {
     "coverage growth": ["{store}"],
     "coverage combos": ["{store}"],
     "coverage sequences": ["{store}"],
+    "coverage iso34502": ["{store}"],
     "coverage spec": ["{store}", "--slots", "{slots}"],
     "coverage windows": ["{store}"],
     "coverage explain": ["{store}:MATCH (e:Ego) WHERE e.speed > 5", "--by", "{store}"],

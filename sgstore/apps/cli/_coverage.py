@@ -266,6 +266,28 @@ def sequences_(
     _report_below(found.shares, table, ask, limit)
 
 
+@coverage.command("iso34502")
+def iso34502_(
+    a: str,
+    missing: bool = False,
+    covered: bool = False,
+    limit: Limit = None,
+    *,
+    ask: FrameAskOptions,
+) -> None:
+    """Count the 24 traffic disturbances of ISO 34502: road, behaviour of the ego, behaviour of another vehicle.
+
+    A cell is unknown, and not 0, if no trace has the data that its pattern needs.
+    """
+    from sgstore.apps.verbs import listed
+    from sgstore.testsets.coverage import iso34502
+
+    (chosen,) = ask.frames(a)
+    say_scope(chosen.scope(world=True), ask.chosen)
+    found = iso34502(chosen)
+    _report_below(found[0], listed(found, missing=missing, covered=covered), ask, limit)
+
+
 @coverage.command("spec")
 def spec_(
     a: str,

@@ -39,6 +39,7 @@ from sgstore.testsets.coverage._failures import (
 )
 from sgstore.testsets.coverage._features import Combinations, combos, features
 from sgstore.testsets.coverage._frames import ReportTable, of_unknown
+from sgstore.testsets.coverage._iso34502 import iso34502
 from sgstore.testsets.coverage._sequences import (
     WITHIN_S,
     check_sequences,
@@ -70,6 +71,7 @@ __all__ = [
     "frames_of",
     "growth",
     "happenings",
+    "iso34502",
     "manoeuvres_named",
     "names_of",
     "novel",
