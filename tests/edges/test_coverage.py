@@ -502,9 +502,11 @@ where = "MATCH (:Ego)"
 [[slot]]
 name = "person"
 values = { near = "MATCH (:Person)-[:near]->(:Ego)", seen = "MATCH (:Person)-[:visible]->(:Ego)" }
+none = true
 [[slot]]
 name = "truck"
 values = { near = "MATCH (:Truck)-[:near]->(:Ego)", ahead = "MATCH (:Truck)-[:inDFrontOf]->(:Ego)" }
+none = true
 [[slot]]
 name = "car"
 values = { any = "MATCH (:Car&!Ego)-->(:Ego)" }
@@ -541,7 +543,7 @@ def test_values_of_slots_are_combined_as_loops_combine_them(
     domains = {
         "person": ["none", "near", "seen"],
         "truck": ["none", "near", "ahead"],
-        "car": ["none", "any"],
+        "car": ["any"],  # without none = true
     }
     wanted: Counter[Any] = Counter()
     for some in combinations(domains, k or 3):
@@ -564,7 +566,8 @@ def test_values_of_slots_are_combined_as_loops_combine_them(
 def test_the_matrix_of_slots_is_that_of_loops(worlds: Worlds, tmp_path: Path) -> None:
     a, _, of_a, _ = worlds
     file = tmp_path / "slots.toml"
-    file.write_text(f"{SLOTS}[[impossible]]\ncar = 'none'\n")
+    with_none = SLOTS.replace('(:Ego)" }\n[[imp', '(:Ego)" }\nnone = true\n[[imp')
+    file.write_text(f"{with_none}[[impossible]]\ncar = 'none'\n")
     (declared,) = Specification.read(file)
     items, frames, wanted = declared.matrix(selection_of(a))
     there = [slots_of(scene) for trace in of_a for scene in trace]
@@ -594,12 +597,12 @@ def test_slots_ask_tables_of_tags_beside_their_file(worlds: Worlds, tmp_path: Pa
     _, there, _ = slot_coverage(selection_of(a), [declared])
     frames = {one.name: one.frames for one in store.info()}
 
-    assert dict(row[1:3] for row in there.rows) == {
+    assert dict(row[1:3] for row in there.rows) == {"road=city": frames[first]}
+    _, names, code = slot_sets(selection_of(a), declared)
+    assert Counter(names[i] for i in code.tolist()) == {
         "road=city": frames[first],
         "road=none": sum(frames[name] for name in others),
     }
-    _, names, code = slot_sets(selection_of(a), declared)
-    assert Counter(names[i] for i in code.tolist()) == dict(row[1:3] for row in there.rows)
 
 
 def test_attributes_of_the_operational_design_domain_come_along(town_store: Path) -> None:
@@ -620,8 +623,36 @@ def test_attributes_of_the_operational_design_domain_come_along(town_store: Path
             ((rows,),) = store.sql(f"SELECT count(DISTINCT frame_id) FROM nodes WHERE {where}")
             assert counted[item] == rows, item
 
-    assert counted["rainfall", "none"] == 750  # the sample tells no weather
-    assert not wanted[items.index(("rainfall", "none"))].any()
+    assert ("rainfall", "none") not in counted
+    assert wanted[items.index(("junction", "none"))].any()
+    said = slot_coverage(selection_of(str(town_store)), [odd], 1)[0].said
+    unknown = [
+        slot.name for slot in odd.slots if not any(counted[slot.name, v] for v in slot.domain)
+    ]
+    assert said[1:] == [f"{odd.name}: no frame has a value of {', '.join(unknown)}"]
+    assert "rainfall" in unknown  # the sample has no weather
+
+
+def test_no_value_of_a_slot_counts_only_if_the_slot_says_so(tmp_path: Path) -> None:
+    store = written(tmp_path, "a", [[{("car_0", "near", "ego")}]])
+    one = "[[slot]]\nname = 'car'\nvalues = {near = 'MATCH (:Car)-[:near]->(:Ego)'}\n"
+    other = "[[slot]]\nname = 'person'\nvalues = {near = 'MATCH (:Person)-[:near]->(:Ego)'}\n"
+    file = tmp_path / "slots.toml"
+    found: dict[str, tuple[object, ...]] = {}
+    for text in (f"{one}{other}", f"{one}{other}none = true\n[[impossible]]\ncar = 'none'\n"):
+        file.write_text(text)
+        shares, there, missing = slot_coverage(selection_of(store), Specification.read(file))
+        found[text] = (
+            shares.rows[0][1:3],
+            there.column("combination"),
+            missing.column("combination"),
+        )
+        assert "impossible" not in shares.rows[0][4]  # none of car does not count
+
+    assert [*found.values()] == [
+        ((0, 1), [], ["car=near, person=near"]),
+        ((1, 2), ["car=near, person=none"], ["car=near, person=near"]),
+    ]
 
 
 @pytest.mark.parametrize("width", [1, 2])
@@ -660,6 +691,7 @@ def test_slots_are_classes_too(worlds: Worlds, tmp_path: Path, width: int) -> No
         ("name = 'x'", "expected 1 to 200 tables"),
         ("colour = 1", "colour: expected"),
         ("slot = [{name = 'x'}]", "expected 'name' and 'values'"),
+        ("slot = [{name = 'x', values = {a = 'MATCH ()'}, none = 1}]", "expected true or false"),
         ("slot = [{name = 'x', values = {}}]", "slot 'x'"),
         ("slot = [{name = 'x', values = {none = 'MATCH ()'}}]", "no value may be called 'none'"),
         ("slot = [{name = 'x', values = {a = 'MATCH (v) RETURN v.id'}}]", "expected a pattern"),

@@ -8,12 +8,14 @@ Slots are declared in a TOML file::
     [[slot]]
     name = "near"
     values = { front = "MATCH (t:Truck)-[:near]->(:Ego), (t)-[:inDFrontOf]->(:Ego)", side = "MATCH …" }
+    none = true                                    # optional: no value is a value, too
 
     [[impossible]]                                 # combinations that cannot be, and do not count
     near = "none"
 
 A slot has a value in a frame where its pattern holds, several values if several hold, and ``none``
-if none holds; a frame with several values has each combination of them. A file can have several
+if none holds. ``none`` must be covered only if the slot has ``none = true``, because a missing value
+can also be an unknown value. A frame with several values has each combination of them. A file can have several
 such parts, each a ``[[specification]]``. ``tables = { tags = "tags.csv" }`` joins user tables,
 relative to the file, for use in patterns.
 
@@ -181,15 +183,18 @@ class Slot:
     name : str
     values : mapping
         Value → pattern; without ``none``.
+    none : bool
+        True if ``none`` is a value to be covered.
     """
 
     name: str
     values: Mapping[str, str]
+    none: bool = False
 
     @property
     def domain(self) -> tuple[str, ...]:
-        """Return the names of all values of the slot (scene parameter), ``none`` first."""
-        return (NONE, *self.values)
+        """Return the values of the slot (scene parameter) to be covered; ``none`` first, if it counts."""
+        return (NONE, *self.values) if self.none else (*self.values,)
 
     def block(self, value: str) -> tuple[list[str], list[str]]:
         """For a value of the slot, return patterns that a frame must match, and those it must not match."""
@@ -219,6 +224,16 @@ class Specification:
     impossible: tuple[Mapping[str, str], ...]
     tables: Mapping[str, Path] = field(default_factory=dict[str, Path])
 
+    @property
+    def counted_impossible(self) -> list[Mapping[str, str]]:
+        """Return the impossible combinations whose values all count, without those of an uncounted ``none``."""
+        counted = {slot.name: slot.domain for slot in self.slots}
+        return [
+            one
+            for one in self.impossible
+            if all(value in counted[name] for name, value in one.items())
+        ]
+
     def matrix(
         self, chosen: ChosenFrames
     ) -> tuple[list[tuple[str, str]], NDArray[np.int64], Bools]:
@@ -227,7 +242,7 @@ class Specification:
         Returns
         -------
         items : list of (str, str)
-            Slot and value, slot by slot, ``none`` first.
+            Slot and value, slot by slot; ``none`` first, if it counts.
         frames : (F, F) int64
             Frames with both, symmetric; on the diagonal, with the value.
         wanted : (F, F) bool
@@ -253,7 +268,7 @@ class Specification:
         )
         names = np.array([name for name, _ in items])
         wanted = names[:, None] != names[None, :]
-        for one in self.impossible:
+        for one in self.counted_impossible:
             if len(one) <= 2:  # with three values, each pair can be possible
                 ends = [items.index(item) for item in one.items()]
                 wanted[ends[0], ends[-1]] = wanted[ends[-1], ends[0]] = False
@@ -316,7 +331,7 @@ def _specification(path: Path, given: Any, name: str) -> Specification:
     if len({slot.name for slot in made}) < len(made):
         raise ConfigError(f"{path}: two slots have the same name")
     impossible = given.get("impossible", [])
-    domains = {slot.name: slot.domain for slot in made}
+    domains = {slot.name: (NONE, *slot.values) for slot in made}
     for one in impossible if isinstance(impossible, list) else [impossible]:
         for key, value in one.items() if isinstance(one, dict) else [(one, None)]:
             if value not in domains.get(str(key), ()):
@@ -339,9 +354,11 @@ _EXPECTED: Final = "expected a pattern, MATCH … WHERE … only"
 
 
 def _slot(path: Path, given: Any) -> Slot:
-    if not isinstance(given, dict) or given.keys() != {"name", "values"}:
-        raise ConfigError(f"{path}: [[slot]]: expected 'name' and 'values'")
-    name, values = given["name"], given["values"]
+    if not isinstance(given, dict) or given.keys() - {"none"} != {"name", "values"}:
+        raise ConfigError(f"{path}: [[slot]]: expected 'name' and 'values', and optionally 'none'")
+    name, values, none = given["name"], given["values"], given.get("none", False)
+    if not isinstance(none, bool):
+        raise ConfigError(f"{path}: slot {str(name)[:80]!r}: none: expected true or false")
     if (
         not isinstance(name, str)
         or not isinstance(values, dict)
@@ -354,7 +371,7 @@ def _slot(path: Path, given: Any) -> Slot:
         if value == NONE or not isinstance(pattern, str) or block_of(pattern) is None:
             reason = f"no value may be called {NONE!r}" if value == NONE else _EXPECTED
             raise ConfigError(f"{path}: slot {name!r}: {value}: {reason}")
-    return Slot(name, values)
+    return Slot(name, values, none)
 
 
 class _Held:
@@ -453,11 +470,11 @@ def _combined(
             f"{specification.name}: {most:,} combinations; {MOST:,} can be gone through:"
             " combine fewer slots, as pairs: 'sgstore coverage combos --k 2'"
         )
-    there = held.values(specification)
+    there, impossible = held.values(specification), specification.counted_impossible
     for some in combinations(slots, k):
         for values in product(*(slot.domain for slot in some)):
             named = {slot.name: value for slot, value in zip(some, values, strict=True)}
-            if any(one.items() <= named.items() for one in specification.impossible):
+            if any(one.items() <= named.items() for one in impossible):
                 continue
             both = np.bitwise_and.reduce([there[item] for item in named.items()])
             yield some, values, int(np.bitwise_count(both).sum())
@@ -484,13 +501,16 @@ def slot_coverage(
     covered: list[Row] = []
     missing: list[Row] = []
     held = _Held(chosen, {k: v for one in specifications for k, v in one.tables.items()})
+    said = [f"frames of {chosen.text}"]
     for one in specifications:
         size = k or len(one.slots)
         with chosen.snapshot():
             found = list(_combined(one, size, held))
+            said += _without_values(one, held)
         many = sum(frames > 0 for _, _, frames in found)
         denominator = f"combinations of values of {size} of {len(one.slots)} declared slots"
-        denominator += f", less {len(one.impossible)} impossible" if one.impossible else ""
+        cannot = len(one.counted_impossible)
+        denominator += f", less {cannot} impossible" if cannot else ""
         shares.append(share(one.name, many, len(found), denominator))
         for slots, values, frames in found:
             text = ", ".join(f"{s.name}={v}" for s, v in zip(slots, values, strict=True))
@@ -500,12 +520,18 @@ def slot_coverage(
                 missing.append((one.name, text, _query(one, slots, values)))
     if len(specifications) > 1:
         shares.append(share("all", len(covered), len(covered) + len(missing), "the sum of these"))
-    said = [f"frames of {chosen.text}"]
     return (
         ReportTable(SHARES, shares, said),
         ReportTable(("specification", "combination", "frames"), covered),
         ReportTable(("specification", "combination", "query"), missing),
     )
+
+
+def _without_values(one: Specification, held: _Held) -> list[str]:
+    """If slots have no value in any frame, return a list with a note about them; otherwise an empty list."""
+    there = held.values(one)
+    empty = [s.name for s in one.slots if not any(there[s.name, value].any() for value in s.domain)]
+    return [f"{one.name}: no frame has a value of {', '.join(empty)}"] if empty else []
 
 
 def _query(one: Specification, slots: Sequence[Slot], values: Sequence[str]) -> str:
