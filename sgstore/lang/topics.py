@@ -148,9 +148,10 @@ def _like(path: str, fields: Mapping[str, TopicField]) -> str:
     return f"did you mean {like!r}?" if like else f"its fields are {excerpts([*fields])}"
 
 
-_WHOLE: Final = frozenset(
+WHOLE: Final = frozenset(
     {"TINYINT", "UTINYINT", "SMALLINT", "USMALLINT", "INTEGER", "UINTEGER", "BIGINT"}
 )
+"""Database types of whole numbers that fit into a BIGINT."""
 
 
 def common_fields(several: Iterable[Mapping[str, str]]) -> dict[str, str]:
@@ -169,9 +170,9 @@ def common_type(one: str, other: str) -> str:
     if one.endswith("[]") and other.endswith("[]"):
         return f"{common_type(one.removesuffix('[]'), other.removesuffix('[]'))}[]"
     both = {one, other}
-    if both <= _WHOLE:
+    if both <= WHOLE:
         return "BIGINT"
-    return "DOUBLE" if both <= {*_WHOLE, "UBIGINT", "FLOAT", "DOUBLE"} else "VARCHAR"
+    return "DOUBLE" if both <= {*WHOLE, "UBIGINT", "FLOAT", "DOUBLE"} else "VARCHAR"
 
 
 def topics_of_parts(told: Mapping[str, Mapping[str, str]]) -> dict[str, TopicFacts]:

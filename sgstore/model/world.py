@@ -42,6 +42,12 @@ GAP: Final = 2.5
 JUMP_NS: Final = 86_400_000_000_000
 """Assumed time between two frames at a backward clock jump: a day; ns."""
 
+AT_ZERO_NS: Final = 100_000_000
+"""Largest expected time at which a stamp of 0 in another channel is accepted as a real time; ns."""
+
+OTHER_CLOCK_NS: Final = 86_400_000_000_000
+"""Smallest difference between the stamps of two different clocks; ns."""
+
 TOLERANCE_NS: Final = 1_000
 """Smallest time tolerance for equality; ns."""
 

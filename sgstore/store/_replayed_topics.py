@@ -14,7 +14,7 @@ from sgstore.base.temporary_folders import working_folder
 from sgstore.lang.topics import field_list, field_named
 from sgstore.mcap import Findings
 from sgstore.store._schema import INSIDE
-from sgstore.store._topic_views import values_text
+from sgstore.store._topic_views import stamp_text, values_text
 from sgstore.store._topics import FrameClock, TopicWriter, topic_scratch
 
 if TYPE_CHECKING:
@@ -112,20 +112,22 @@ class ReplayedTopics:
                 rows = file.rows(folder)
                 times = connection.execute(f"SELECT DISTINCT log_time_ns FROM ({rows})")
                 log_time = np.ma.getdata(times.fetchnumpy()["log_time_ns"])
-                runs = {"log_time_ns": log_time, "run": clock.columns(log_time)[":run"]}
-                connection.register(f"runs{place}", runs)
+                placed = clock.columns(log_time)
+                times = {"log_time_ns": log_time, "run": placed[":run"], "time": placed[":time_ns"]}
+                connection.register(f"times{place}", times)
                 view = quoted(f":messages {topic}")
                 connection.execute(
-                    f'CREATE TEMP VIEW {view} AS SELECT * REPLACE (run AS ":run")'
-                    f" FROM ({rows}) JOIN runs{place} USING (log_time_ns)"
+                    f'CREATE TEMP VIEW {view} AS SELECT * REPLACE (run AS ":run", time AS ":time_ns")'
+                    f" FROM ({rows}) JOIN times{place} USING (log_time_ns)"
                 )
             for one in asked:
                 found[one] = column = [None] * len(number)
-                fields = field_list(self._files[one.topic][1].fields.items())
-                if not fields:  # JSON without messages
+                declared = self._files[one.topic][1].fields
+                if not declared:  # JSON without messages
                     continue
-                field = field_named(fields, one.topic, one.field)
-                text = values_text(one.topic, field, one.rule, one.tolerance_ns)
+                field = field_named(field_list(declared.items()), one.topic, one.field)
+                stamp = stamp_text(declared)
+                text = values_text(one.topic, field, one.rule, one.tolerance_ns, stamp)
                 for frame, value in connection.execute(text).fetchall():
                     column[frame] = value
         return found

@@ -23,6 +23,7 @@ from sgstore.errors import SqlError, StoreError, TraceError
 from sgstore.lang.catalog import TopicFacts, TopicField, Type
 from sgstore.lang.syntax import TOPIC, topics_in_sql
 from sgstore.lang.topics import (
+    WHOLE,
     TopicError,
     common_fields,
     field_list,
@@ -33,6 +34,7 @@ from sgstore.lang.topics import (
 )
 from sgstore.mcap import Findings, mark_of
 from sgstore.model.frame_ids import SEQ_BITS
+from sgstore.model.world import AT_ZERO_NS, OTHER_CLOCK_NS, TOLERANCE_NS
 from sgstore.store._joins import tables_folder
 from sgstore.store._locking import default_memory, shut_in
 from sgstore.store._schema import INSIDE
@@ -90,9 +92,10 @@ def _show(connection: DuckDBPyConnection, access: Access, facts: TopicFacts, top
     view = quoted(f":messages {topic}")
     connection.execute(f"CREATE OR REPLACE TEMP VIEW {view} AS {rows}")
     listed = "".join(f", m.{quoted(name)}" for name in fields)
+    time = f'coalesce({stamp_text(fields)}, m.":time_ns")'
     connection.execute(
         f"CREATE OR REPLACE TEMP VIEW {quoted(f'{TOPIC} {topic}')} AS"
-        f' SELECT t.name AS trace, round((m.":time_ns" - t.start_ns) / 1e3) / 1e6 AS t, m.log_time_ns,'
+        f" SELECT t.name AS trace, round(({time} - t.start_ns) / 1e3) / 1e6 AS t, m.log_time_ns,"
         f" m.publish_time_ns{listed} FROM {view} m"
         f" JOIN {INSIDE}.trace t ON t.trace_id = m.{quoted(FRAME)} >> {SEQ_BITS}"
     )
@@ -377,6 +380,39 @@ def field_fault(connection: DuckDBPyConnection, sql: str, message: str) -> str:
 # Values at frames.
 
 
+_STAMPS: Final = (
+    ("header.stamp.sec", "header.stamp.nanosec"),  # ROS
+    ("stamp.sec", "stamp.nanosec"),  # ROS, Autoware
+    ("timestamp.seconds", "timestamp.nanos"),  # OSI, protobuf of Foxglove
+    ("timestamp.sec", "timestamp.nsec"),  # JSON and ROS of Foxglove
+    ("timestamp.sec", "timestamp.nanosec"),  # ROS 2 of Foxglove
+)
+"""Fields with the time stamp of a message: seconds and nanoseconds."""
+_AHEAD_NS: Final = 1_000_000_000
+"""Largest time by which a usable stamp is later than the message's log time, by the clock of the frames; ns."""
+
+
+def stamp_text(fields: Mapping[str, str]) -> str:
+    """Return SQL for the time stamp of a message by the clock of the frames; NULL without a usable stamp.
+
+    A stamp of another clock is not usable. A stamp of 0 is a time only near 0, because ROS writes 0 for
+    "missing". A stamp far after its message is from before a backward step of the clock.
+    """
+    for pair in _STAMPS:
+        if all(fields.get(name) in WHOLE for name in pair):
+            sec, nano = (f"CAST({quoted(name)} AS HUGEINT)" for name in pair)
+            stamp, late = (
+                f"({sec} * 1000000000 + {nano})",
+                f'{sec} * 1000000000 + {nano} - ":time_ns"',
+            )
+            usable = (
+                f"{late} BETWEEN {1 - OTHER_CLOCK_NS} AND {_AHEAD_NS}"
+                f' AND ({stamp} <> 0 OR abs(":time_ns") <= {AT_ZERO_NS})'
+            )
+            return f"CASE WHEN {usable} THEN CAST({stamp} AS BIGINT) END"
+    return "CAST(NULL AS BIGINT)"
+
+
 def topic_values(
     connection: DuckDBPyConnection,
     access: Access,
@@ -399,7 +435,7 @@ def topic_values(
         ``last``: of the last message at or before the frame; ``nearest``: of the nearest one, the earlier one
         of two; ``linear``: interpolated between the messages before and after.
     tolerance_ns : int, optional
-        Greatest difference of log times between the frame and the message; ns. ``None`` means unlimited.
+        Greatest time between the frame and the message; ns. ``None`` means unlimited.
 
     Raises
     ------
@@ -408,19 +444,27 @@ def topic_values(
 
     Notes
     -----
-    Values never cross a backward step of the clock of the frames. Among messages of equal log time, the last
-    one counts.
+    A message belongs to the frame whose time is its stamp. If the messages have no stamp by the clock of the
+    frames, log times are compared. Values never cross a backward step of that clock. Among messages of equal
+    time, the last one counts.
     """
     known = field_named(fields_of(facts), facts.name, field)
     if rule == "linear" and known.type is not Type.number:
         reason = f"field {known.name!r} of topic {facts.name!r} is not a number"
         raise TopicError(reason, "rules for it are last and nearest")
     _show(connection, access, facts, facts.name)
-    return values_text(facts.name, known, rule, tolerance_ns)
+    rows = connection.execute(f"DESCRIBE {quoted(f':messages {facts.name}')}").fetchall()
+    stamp = stamp_text({str(row[0]): str(row[1]) for row in rows})
+    return values_text(facts.name, known, rule, tolerance_ns, stamp)
 
 
-def values_text(topic: str, field: TopicField, rule: str, tolerance_ns: int | None) -> str:
-    """Return SQL that selects a topic field's value at each frame. The view of the topic must exist."""
+def values_text(
+    topic: str, field: TopicField, rule: str, tolerance_ns: int | None, stamp: str
+) -> str:
+    """Return SQL that selects a topic field's value at each frame. The view of the topic must exist.
+
+    ``stamp``: see :func:`stamp_text`.
+    """
     within = "" if tolerance_ns is None else f" <= {int(tolerance_ns)}"
     value = _value(field.name)
     if field.declared in {"FLOAT", "DOUBLE"}:
@@ -428,8 +472,10 @@ def values_text(topic: str, field: TopicField, rule: str, tolerance_ns: int | No
     values = _VALUES.format(
         shift=SEQ_BITS,
         value=value,
+        stamp=stamp,
         messages=quoted(f":messages {topic}"),
         inside=INSIDE,
+        rounded=TOLERANCE_NS,
     )
     chosen = {"last": _LAST, "nearest": _NEAREST, "linear": _LINEAR}[rule]
     limits = {"before": f"f.at - b.at{within}", "after": f"a.at - f.at{within}"}
@@ -445,20 +491,30 @@ def _value(name: str) -> str:
     return f"{quoted(element[1])}[{int(element[2]) + 1}]"
 
 
-_VALUES: Final = """WITH m AS (
-  SELECT ":frame" >> {shift} AS trace_id, ":run" AS run, log_time_ns AS at,
-         arg_max_null({value}, ":number") AS value
-  FROM {messages} GROUP BY ALL
-), f AS (
-  SELECT frame_id, trace_id, log_time_ns AS at,
+_VALUES: Final = """WITH stamped AS (
+  SELECT ":frame" >> {shift} AS trace_id, ":run" AS run, ":number", log_time_ns, ":time_ns",
+         {stamp} AS stamp, count(stamp) OVER (PARTITION BY trace_id, run) > 0 AS by_stamp,
+         {value} AS value
+  FROM {messages}
+), m AS (
+  SELECT trace_id, run, by_stamp,
+         CASE WHEN by_stamp THEN coalesce(stamp, ":time_ns") ELSE log_time_ns END AS at,
+         arg_max_null(value, ":number") AS value
+  FROM stamped GROUP BY ALL
+), frames AS (
+  SELECT frame_id, trace_id, time_ns, log_time_ns,
          CAST(coalesce(sum(back) OVER (PARTITION BY trace_id ORDER BY seq), 0) AS INTEGER) AS run
   FROM (
     SELECT *, CAST(time_ns < lag(time_ns) OVER (PARTITION BY trace_id ORDER BY seq) AS INTEGER) AS back
     FROM {inside}.frame
   )
+), f AS (
+  SELECT frame_id, trace_id, run, CASE WHEN by_stamp THEN time_ns ELSE log_time_ns END AS at,
+         CASE WHEN by_stamp THEN {rounded} ELSE 0 END AS rounded
+  FROM frames JOIN (SELECT DISTINCT trace_id, run, by_stamp FROM m) USING (trace_id, run)
 )
 """
-_BEFORE: Final = "m b ON b.trace_id = f.trace_id AND b.run = f.run AND f.at >= b.at"
+_BEFORE: Final = "m b ON b.trace_id = f.trace_id AND b.run = f.run AND f.at + f.rounded >= b.at"
 _AFTER: Final = "m a ON a.trace_id = f.trace_id AND a.run = f.run AND f.at <= a.at"
 _LAST: Final = f"SELECT f.frame_id, b.value FROM f ASOF JOIN {_BEFORE} WHERE {{before}} AND b.value IS NOT NULL"
 _BOTH: Final = f"FROM f ASOF LEFT JOIN {_BEFORE} ASOF LEFT JOIN {_AFTER}"

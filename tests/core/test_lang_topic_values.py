@@ -29,6 +29,15 @@ SCHEMA = json.dumps(
             "ok": {"type": "boolean"},
             "inner": {"type": "object", "properties": {"odd-name": {"type": "number"}}},
             "values": {"type": "array", "items": {"type": "number"}},
+            "header": {
+                "type": "object",
+                "properties": {
+                    "stamp": {
+                        "type": "object",
+                        "properties": {"sec": {"type": "integer"}, "nanosec": {"type": "integer"}},
+                    }
+                },
+            },
         },
     }
 ).encode()
@@ -40,14 +49,20 @@ Message = tuple[int, dict[str, Any]]
 def wanted(
     messages: list[Message], frames: list[tuple[int, int]], rule: str, tolerance: float
 ) -> list[float | None]:
-    """The definition: the value of ``z`` at each frame (log time, simulation time); ms."""
+    """The definition: the value of ``z`` at each frame (log time, simulation time); ms.
+
+    Messages with stamps are compared by simulation time, otherwise by log time.
+    """
     runs = [*accumulate(b[1] < a[1] for a, b in pairwise([frames[0], *frames]))]
     starts = {run: frames[runs.index(run)][0] for run in runs}
     found: list[float | None] = []
-    for (now, _), run in zip(frames, runs, strict=True):
+    for (log, sim), run in zip(frames, runs, strict=True):
         ends = starts.get(run + 1, float("inf"))
+        now = sim if "header" in messages[0][1] else log
         of_run = [
-            (t, m.get("z")) for t, m in messages if (t >= starts[run] or not run) and t < ends
+            (stamped(m) if "header" in m else t, m.get("z"))
+            for t, m in messages
+            if (t >= starts[run] or not run) and t < ends
         ]
         one_each = sorted(dict(of_run).items())  # of equal times the last one counts
         before = [(now - t, z) for t, z in one_each if t <= now and now - t <= tolerance]
@@ -66,19 +81,30 @@ def wanted(
     return found
 
 
-def recorded(path: Path, seed: int) -> tuple[list[Message], list[tuple[int, int]]]:
+def stamped(message: dict[str, Any]) -> int:
+    stamp = message["header"]["stamp"]
+    return stamp["sec"] * 1000 + stamp["nanosec"] // 10**6
+
+
+def recorded(
+    path: Path, seed: int, *, stamps: bool = False
+) -> tuple[list[Message], list[tuple[int, int]]]:
     """Write a drive with messages at random times: equal times, gaps, missing fields, a clock that jumps."""
     rng = random.Random(seed)
     log, stamp, frames = 1000, 0, list[tuple[int, int]]()
     for _ in range(40):
         log += rng.choice((50, 100, 100, 150, 400))
-        stamp = 0 if rng.random() < 0.04 else stamp + 100
+        # A stamp of 0 without stamps near 0 after it counts as missing.
+        stamp = 0 if rng.random() < 0.04 and len(frames) < 38 else stamp + 100
         frames.append((log, stamp))
     times = sorted(
         rng.choice((rng.randrange(900, log + 200), rng.choice(frames)[0])) for _ in range(60)
     )
     times = [t for t in times if not 1800 < t < 2600]
     messages = [(t, content(rng)) for t in times]
+    if stamps:
+        messages = [(t + rng.randrange(3), with_header(m, rng, t, frames)) for t, m in messages]
+        messages.sort(key=lambda one: one[0])
     with Recorder(path) as recorder:
         written = [(t, 1, m) for t, m in messages] + [(t, 0, s) for t, s in frames]
         for t, kind, what in sorted(written, key=lambda one: one[:2]):
@@ -89,6 +115,15 @@ def recorded(path: Path, seed: int) -> tuple[list[Message], list[tuple[int, int]
                 ego, other = car(1, x=t / 100, v=(10, 0)), car(2, x=t / 100 + t % 61)
                 recorder.ground_truth(t / 1000, [ego, other], host=1, stamp=what / 1000)
     return messages, frames
+
+
+def with_header(
+    message: dict[str, Any], rng: random.Random, log: int, frames: list[tuple[int, int]]
+) -> dict[str, Any]:
+    """Add a header: often the exact time of the frame before the message, else a time near it."""
+    _, sim = max([frame for frame in frames if frame[0] <= log] or [frames[0]])
+    sim = max(sim + rng.choice((0, 0, 0, -120, -7, 5)), 1)
+    return message | {"header": {"stamp": {"sec": sim // 1000, "nanosec": sim % 1000 * 10**6}}}
 
 
 def content(rng: random.Random) -> dict[str, Any]:
@@ -104,11 +139,11 @@ RULES = [
 ]
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_values_are_those_of_the_definition(tmp_path: Path, seed: int) -> None:
+@pytest.mark.parametrize(("seed", "stamps"), [(0, False), (1, False), (0, True), (1, True)])
+def test_values_are_those_of_the_definition(tmp_path: Path, seed: int, stamps: bool) -> None:
     """In find, check and the monitor, from a store with and without the topic as columns."""
     path = tmp_path / "drive.mcap"
-    messages, frames = recorded(path, seed)
+    messages, frames = recorded(path, seed, stamps=stamps)
     store = sgstore.open(tmp_path / "s.sgstore", create=True)
     store.ingest(path, config=from_dict({"topics": ["/imu"]} if seed % 2 else {}))
     topics = [
@@ -290,3 +325,29 @@ def test_online_frames_carry_messages() -> None:
         "unknown",
         "trace online has no topic /y",
     )
+
+
+def test_a_message_belongs_to_the_frame_of_its_stamp(tmp_path: Path) -> None:
+    """A message is logged 1 ms after its frame; its stamp is the time of the frame, rounded down."""
+    with Recorder(tmp_path / "drive.mcap") as recorder:
+        channel = recorder.channel("/planner", "Planner", SCHEMA)
+        for frame in range(5):
+            log, ns = 100 + frame / 10, 3_000_000_000 + frame * 100_000_000 - frame % 2
+            recorder.ground_truth(log, [car(1, x=frame)], host=1, stamp=3 + frame / 10)
+            stamp = {"sec": ns // 10**9, "nanosec": ns % 10**9}
+            late = {"z": frame, "header": {"stamp": stamp}}
+            recorder.write(channel, log + 0.001, json.dumps(late).encode())
+            other = {"z": frame, "header": {"stamp": {"sec": 10**9, "nanosec": 0}}}
+            wall = recorder.channel("/wall_clock", "Planner", SCHEMA)
+            recorder.write(wall, log + 0.001, json.dumps(other).encode())
+    store = sgstore.open(tmp_path / "s.sgstore", create=True)
+    store.ingest(tmp_path / "drive.mcap")
+    rules = ("", ", nearest", ", linear")
+    text = ", ".join(f"topic('/planner'{rule}).z" for rule in rules)
+    rows = store.find(f"MATCH (e:Ego) RETURN {text} ORDER BY frame.seq").rows()
+    values = [[row[number] for number in range(3)] for row in rows]
+    assert values == [pytest.approx([frame] * 3) for frame in range(5)]
+    rows = store.find("MATCH (e:Ego) RETURN topic('/wall_clock').z ORDER BY frame.seq").rows()
+    assert [row[0] for row in rows] == [None, 0, 1, 2, 3]  # another clock: by log time
+    rows = store.sql("SELECT t FROM topic('/planner')")
+    assert [row[0] for row in rows] == pytest.approx([frame / 10 for frame in range(5)])
