@@ -33,6 +33,37 @@ class Loss:
     offset: int = -1
 
 
+@dataclass(frozen=True, slots=True)
+class Passes:
+    """Parts of a file with the same log times, because the clock stepped back while the file was written.
+
+    Attributes
+    ----------
+    count : int
+        Number of parts.
+    start_ns, end_ns : int
+        First and last log time that two parts have; ns.
+    topic : str
+    number : int
+        Number of the first message of the topic after the step, from 1.
+    """
+
+    count: int
+    start_ns: int
+    end_ns: int
+    topic: str
+    number: int
+
+    @property
+    def reason(self) -> str:
+        """The fault and its place, as text."""
+        back = f"{(self.end_ns - self.start_ns) / 1e9:.3g} s"
+        return (
+            f"the log clock steps back by {back} before message {self.number} of {self.topic}:"
+            f" {self.count} passes have the same times, and their messages are mixed"
+        )
+
+
 @dataclass(slots=True)
 class Findings:
     """Losses and warnings from reading a recording, filled while the messages are read.
@@ -43,10 +74,13 @@ class Findings:
         Oddities without loss of data.
     losses : list of Loss
         Unusable parts.
+    passes : Passes or None
+        Parts of the file with the same log times; ``None`` without such parts.
     """
 
     warnings: list[str] = field(default_factory=list[str])
     losses: list[Loss] = field(default_factory=list[Loss])
+    passes: Passes | None = None
 
     def lose(self, loss: Loss) -> None:
         """Add an unreadable part to the report. If the list is full, the last entry sums up all others."""

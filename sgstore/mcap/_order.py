@@ -25,12 +25,13 @@ from array import array
 from bisect import bisect_right
 from collections import OrderedDict
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, NamedTuple
 
 import numpy as np
 
 from sgstore.errors import TraceError
 from sgstore.mcap._chunks import IDS, MESSAGE_HEAD, Messages
+from sgstore.mcap._findings import Passes
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -55,6 +56,13 @@ COLUMN_BYTES: Final = 8 * 6
 """Memory that the columns of one message need, without its data; bytes."""
 OFTEN: Final = 2
 """Number of times that a chunk may be read in one pass without a warning."""
+
+MIXED: Final = 20
+"""Smallest number of changes between the passes of a file, in order of time, that count as mixed passes."""
+LONG: Final = 0.5
+"""Smallest share of the longest step back for a new pass. Shorter steps are jitter of the log times."""
+MOST_PASSES: Final = 16
+"""Largest number of passes of a file. A channel with more steps back is merely unsorted."""
 
 _ENTRY: Final = np.dtype([("log", "i8"), ("publish", "u8"), ("channel", "u2"), ("row", "u2")])
 _BLOCK: Final = 1 << 15  # A block has less than twice as many messages, because a row has 16 bits.
@@ -169,6 +177,20 @@ def published(log_time: Ints, publish_time: Times, channel: NDArray[Any]) -> Tim
     return result
 
 
+class _Step(NamedTuple):
+    """Step back in the log times of a channel.
+
+    ``start_ns``, ``end_ns``: log times after and before it. ``message``, ``number``: number of the message
+    after it in the file, from 0, and in its channel, from 1.
+    """
+
+    message: int
+    channel: int
+    number: int
+    start_ns: int
+    end_ns: int
+
+
 class OrderCheck:
     """Check that the messages of a file are sorted by time, group by group.
 
@@ -279,6 +301,9 @@ class TimeOrder:
         self._cache: OrderedDict[int, Messages] = OrderedDict()
         self._last = np.zeros(IDS, np.int64)
         self._back = 0
+        # For each channel: its number of messages, and its steps back in log time.
+        self._counts = np.zeros(IDS, np.int64)
+        self._steps: dict[int, list[_Step]] = {}
         # For each run: its file offset, its first message number, its data size, and a flag for chunks.
         self._places, self._starts = array("q"), array("q", [0])
         self._bytes, self._is_chunk = array("q"), array("b")
@@ -290,6 +315,22 @@ class TimeOrder:
         most = max(len(codes) // _PARTS, _SAMPLE)
         parts = [*_in_order(blocks, _KEYS, most)] if blocks else []
         self._order = np.concatenate([np.zeros(0, np.uint32), *parts])
+        self._passes = self._mixed(ranks)
+
+    def _mixed(self, ranks: ChannelRanks) -> Passes | None:
+        """Return the passes of the file if their messages are mixed in order of time."""
+        steps = [one for of_channel in self._steps.values() for one in of_channel]
+        if not steps or max(map(len, self._steps.values())) >= MOST_PASSES:
+            return None
+        least = max(one.end_ns - one.start_ns for one in steps) * LONG
+        steps = sorted(one for one in steps if one.end_ns - one.start_ns >= least)
+        first = steps[0]
+        begins = np.array([one.message for one in steps if one.channel == first.channel])
+        of = np.searchsorted(begins, self._order, side="right")
+        if np.count_nonzero(np.diff(of)) < MIXED:
+            return None
+        ends = min(one.start_ns for one in steps), max(one.end_ns for one in steps)
+        return Passes(len(begins) + 1, *ends, ranks.channels[first.channel].topic, first.number)
 
     def _blocks(
         self, runs: Iterable[Messages], keeps: Callable[[int], bool], codes: bytearray
@@ -315,9 +356,17 @@ class TimeOrder:
         """Record position and channels of a group of messages, and the largest step back in log time."""
         for number in np.unique(run.channel).tolist():
             self._kept[number] = keeps(number)
-            times = run.log_time_ns[run.channel == number]
-            back = int(-np.diff(times, prepend=self._last[number]).min())
-            self._back = max(self._back, back)
+            rows = np.flatnonzero(run.channel == number)
+            times = run.log_time_ns[rows]
+            before = np.append(self._last[number], times[:-1])
+            for at in np.flatnonzero(times < before).tolist():
+                ends = int(times[at]), int(before[at])
+                self._back = max(self._back, ends[1] - ends[0])
+                steps = self._steps.setdefault(number, [])
+                if len(steps) < MOST_PASSES:
+                    message, count = self._starts[-1] + int(rows[at]), int(self._counts[number])
+                    steps.append(_Step(message, number, count + at + 1, *ends))
+            self._counts[number] += len(rows)
             self._last[number] = times[-1]
         is_chunk = run.chunk_offset >= 0
         self._places.append(run.chunk_offset if is_chunk else int(run.offset[0]))
@@ -337,7 +386,10 @@ class TimeOrder:
         report.warnings += self.findings.warnings
         for loss in self.findings.losses:
             report.lose(loss)
-        if self._back > 0:
+        report.passes = self._passes
+        if self._passes is not None:
+            report.warnings.append(self._passes.reason)
+        elif self._back > 0:
             report.warnings.append(
                 f"log times run back in the file by up to {self._back / 1e9:g} s on one channel:"
                 " messages are read in order of log time"

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
     from sgstore.graphs.online import Entity, Frame
     from sgstore.maps.roads import RoadMap
-    from sgstore.mcap import Loss
+    from sgstore.mcap import Loss, Passes
     from sgstore.model.world import Bools, Floats, Ints
 
 JUMP: Final = 2.5
@@ -100,6 +100,7 @@ LONGEST_NS: Final = 10_000_000_000
 """Longest plausible time between frames; ns. A longer time means a wrong unit."""
 
 REMEDY: Final = {
+    "mixed passes": "write the messages before the step and those after it to two files",
     "velocity unit": "write m/s, metres and nanoseconds",
     "velocity axes": "write velocities in the axes of the positions (x east, y north)",
     "velocity missing": "leave out a velocity that is unknown, instead of 0",
@@ -137,6 +138,16 @@ REMEDY: Final = {
     "control range": "write throttle and brake from 0 to 1, steering from -1 to 1",
 }
 """Kind of implausible data → what the user can do about it."""
+
+_OF_STEPS: Final = frozenset(
+    (
+        *("velocity unit", "velocity axes", "velocity missing", "frozen", "heading", "backwards"),
+        *("acceleration unit", "gravity", "yaw rate unit", "yaw rate sign", "impossible speed"),
+        *("teleport", "swapped ids", "reused id", "size jump", "doubled stamps", "unsorted stamps"),
+        *("light order", "light flickers"),
+    )
+)
+"""Kinds that compare frames. Mixed passes of a recording cause them, too."""
 
 _VEHICLES: Final = np.array([KIND_CODE[kind] for kind in kinds_labelled("Vehicle") or ()])
 _ON_ROAD: Final = np.array([KIND_CODE[kind] for kind in ("car", "truck", "van", "bus")])
@@ -221,6 +232,7 @@ class Plausibility:
         self._kinds: Ints = np.zeros(0, np.int64)
         self._rows: BodyRows | None = None
         self._times: Ints = np.zeros(0, np.int64)
+        self._log_times: Ints = np.zeros(0, np.int64)
         self._tally = Tally()
         self._events: dict[str, _Event] = {}
         self._moves: list[_Move] = []
@@ -248,6 +260,7 @@ class Plausibility:
         self._lights |= {before + row: entities.map_ref[row] for row in lights}
         self._kinds = np.concatenate([self._kinds, entities.kind.astype(np.int64)])
         self._times = np.concatenate([self._times, block.time_ns])
+        self._log_times = np.concatenate([self._log_times, block.log_time_ns])
         missing = np.flatnonzero(block.ego < 0)
         present = np.flatnonzero(block.ego >= 0)
         if len(present):
@@ -327,13 +340,16 @@ class Plausibility:
             )
         )
 
-    def findings(self, losses: Sequence[Loss] = ()) -> list[Finding]:
+    def findings(self, losses: Sequence[Loss] = (), passes: Passes | None = None) -> list[Finding]:
         """Return the implausible data, one finding for each kind. Call it once, after the last block.
 
         Parameters
         ----------
         losses : sequence of Loss
             Losses of the reader. Values that are impossible alone are among them.
+        passes : Passes, optional
+            Parts of the recording with the same log times. Findings that begin among their mixed frames are
+            replaced by one with the reason.
         """
         contradicting = sum(vote.rows for vote in self._tally.votes.values())
         found = [
@@ -364,6 +380,12 @@ class Plausibility:
             found.append(
                 self._finding(kind, event.node, event.frame, event.nodes, event.times, event.value)
             )
+        if passes is not None:
+            within = (self._log_times >= passes.start_ns) & (self._log_times <= passes.end_ns)
+            mixed = {row + later for row in np.flatnonzero(within).tolist() for later in (0, 1)}
+            found = [one for one in found if one.kind not in _OF_STEPS or one.frame not in mixed]
+            first, times = min(mixed, default=0), int(within.sum())
+            found.append(self._finding("mixed passes", -1, first, (), times, passes.reason))
         order = list(REMEDY)
         return sorted(found, key=lambda one: order.index(one.kind))
 

@@ -845,8 +845,9 @@ class LifetimeTracker:
     def settle(self) -> None:
         """Add warnings about reused ids and gaps of the clock to the report."""
         warnings = self._roster.report.warnings
-        warnings += self._warnings[: self.MOST]
-        if len(self._warnings) > self.MOST:
+        most = self.MOST if self._roster.report.passes is None else 0
+        warnings += self._warnings[:most]
+        if len(self._warnings) > most:
             warnings.append(f"{len(self._warnings)} ids in all come back as other entities")
         if self._gaps:
             longest = max(self._gaps) / 1e9

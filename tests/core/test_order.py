@@ -25,6 +25,7 @@ import sgstore.mcap._order as order
 from sgstore.apps.cli import run
 from sgstore.apps.demo import RECORDING
 from sgstore.mcap import Findings, McapFile, Messages
+from sgstore.pipeline.doctor import examine
 from sgstore.readers import channel_rank, open_trace
 
 if TYPE_CHECKING:
@@ -420,3 +421,51 @@ def test_sorting_takes_at_most_64_mb_of_data(mixed: bool, tmp_path: Path) -> Non
         assert count == 600
 
     assert peak_of(lambda: read(lambda _: 1)) <= peak_of(lambda: read(None)) + (64 << 20)
+
+
+def passes(path: Path, starts: list[float], *, frames: int = 30, v: float = 10) -> Findings:
+    """Write passes of a drive one after another, each with its own log times, and read the file."""
+    with recordings.Recorder(path, chunk_size=2000) as recorder:
+        for number, start in enumerate(starts):
+            for i in range(frames):
+                t = start + i / 10
+                recorder.ground_truth(t, [recordings.car(1, x=v * t + 90 * number)], host=1)
+    return read(path)
+
+
+def read(path: Path) -> Findings:
+    """Read a file in order of time. The first attempt finds that it is not in order."""
+    report = Findings()
+    with McapFile(path) as file:
+        with pytest.raises(order.OutOfOrder):
+            list(file.walk(Findings(), rank=lambda _: 0))
+        logged = np.concatenate([run.log_time_ns for run in file.walk(report, rank=lambda _: 0)])
+    assert (np.diff(logged) >= 0).all()
+    return report
+
+
+def test_mixed_passes_are_reported_with_their_place(tmp_path: Path) -> None:
+    (tmp_path / "d").mkdir()
+    path = tmp_path / "d/two.mcap"
+    report = passes(path, [0, 1])
+    assert report.passes is not None
+    assert (report.passes.count, report.passes.number) == (2, 31)
+    assert (report.passes.start_ns, report.passes.end_ns) == (10**9, 2_900_000_000)
+    found = examine(path)
+    assert [one["kind"] for one in found.implausible] == ["mixed passes"]
+    reason = "the log clock steps back by 1.9 s before message 31 of truth: 2 passes"
+    assert found.implausible[0]["value"].startswith(reason)
+    assert found.implausible[0]["frame"] == 10
+    assert "two files" in found.implausible[0]["remedy"]
+    assert not any("new entity" in one for one in found.warnings)
+
+
+def test_parts_that_do_not_overlap_are_merely_unsorted(tmp_path: Path) -> None:
+    report = passes(tmp_path / "swapped.mcap", [3, 0])
+    assert report.passes is None
+    assert "log times run back in the file by up to 5.9 s" in report.warnings[0]
+    path = tmp_path / "late.mcap"
+    with recordings.Recorder(path) as recorder:
+        for t in (9.0, *(i / 10 for i in range(80))):  # one message is written too early
+            recorder.ground_truth(t, [recordings.car(1, x=t)], host=1)
+    assert read(path).passes is None
