@@ -332,10 +332,10 @@ def of_crowd(
     )
     ((most,),) = Store(store).sql(sql).values
     with served(store) as server:
-        page = visited(browser, server, 900, 700)
+        page = visited(browser, server, 1000, 700)
         asked(page, LARGE, 1)
         told = playing(page, seconds, farther=farther, speed=speed)
-        yield Measure(f"plays {most} entities, 900 by 700", told["fps"], "frames/s", "aim 30")
+        yield Measure(f"plays {most} entities, 1000 by 700", told["fps"], "frames/s", "aim 30")
         yield Measure("  frames of the recording shown", told["shown"], "frames/s", "aim 30")
         yield Measure("  a step, 95th percentile", told["p95"], "ms")
         yield Measure("  processor time a frame", told["spent"], "ms")
