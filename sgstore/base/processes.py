@@ -20,6 +20,7 @@ import sys
 import threading
 from collections import deque
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from queue import SimpleQueue
 from typing import IO, TYPE_CHECKING, Any, Final, Self
@@ -205,7 +206,7 @@ def requests() -> Iterator[dict[str, Any]]:
 
     The worker exits at once when its parent process ends it or dies.
     """
-    sys.stdout = sys.stderr  # printed text must not mix with the replies
+    _replies()
     lines: SimpleQueue[bytes] = SimpleQueue()
     threading.Thread(target=_read, args=(lines,), daemon=True).start()
     while True:
@@ -225,10 +226,21 @@ def send_reply(values: Mapping[str, Any]) -> None:
 
     With ``more`` in the reply, other replies follow.
     """
-    assert sys.__stdout__ is not None  # noqa: S101 - a pipe to the parent process
     with suppress(BrokenPipeError):  # the parent process is dead, and this process about to exit
-        sys.__stdout__.buffer.write(json.dumps(values).encode() + b"\n")
-        sys.__stdout__.buffer.flush()
+        _replies().write(json.dumps(values).encode() + b"\n")
+        _replies().flush()
+
+
+@cache
+def _replies() -> IO[bytes]:
+    """Return the pipe to the parent process. Printed text goes to stderr, so that it does not mix with replies.
+
+    Libraries print without Python: DuckDB shows the progress of a query after two seconds.
+    """
+    pipe = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    sys.stdout = sys.stderr
+    return pipe
 
 
 def folders() -> list[str]:

@@ -11,6 +11,7 @@ from sgstore.base.processes import requests, send_reply
 def main() -> None:
     for request in requests():
         print("printed text")
+        os.write(1, b"\r  8% printed by a library")
         if request["do"] == "die":
             os.kill(os.getpid(), signal.SIGKILL)
         if request["do"] == "fail":
