@@ -135,6 +135,31 @@ def test_graphs_and_why_not_are_those_of_a_store(watched: Any, open_town: Store)
         run.frame(FRAMES)
 
 
+def test_values_of_conditions_are_those_of_a_store(watched: Any, open_town: Store) -> None:
+    run, events, _ = watched
+    nodes = next(event for event in events if event.kind == "found").nodes
+    for seq in (0, FRAMES // 2, FRAMES - 1):
+        values = run.values("pattern", seq, nodes)["values"]
+        of_store = open_town.condition_values(NEAR, f"town#{seq}", nodes)
+        assert [lane["text"] for lane in run.parts("pattern", nodes)["lanes"]][1:] == [
+            "v.speed > 1",
+            "e.speed < 20",
+        ]
+        for lane, of in zip(values, of_store, strict=True):
+            for condition, stored in zip(lane, of, strict=True):
+                assert [(one["name"], one["unit"]) for one in condition] == [
+                    (one.name, one.unit) for one in stored
+                ]
+                assert [one["value"] for one in condition] == pytest.approx(
+                    [one.value for one in stored], abs=1e-3
+                )
+    assert values[1][0][0]["name"] == "v.speed"
+    with pytest.raises(StoreError, match="not kept; those from #0 on are"):
+        run.values("pattern", FRAMES, nodes)
+    with pytest.raises(QueryNameError, match="no pattern 'other'"):
+        run.values("other", 0, nodes)
+
+
 def test_curves_are_those_of_a_store(watched: Any, open_town: Store) -> None:
     run, events, _ = watched
     nodes = next(event for event in events if event.kind == "found").nodes

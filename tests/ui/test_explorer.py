@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shutil
 import subprocess
 import sys
@@ -297,6 +298,9 @@ def test_a_monitor_is_seen_while_it_runs(visit: Callable[..., Any]) -> None:
         page.locator(".tile", has_text="pattern").first.click()
         page.locator(".timeline .lane[data-holds=true]").first.wait_for()
         expect(page.locator(".scene .timeline .label").first).to_contain_text("events in this")
+        expect(page.locator(".conditions > li")).to_have_text(
+            re.compile(r"^✓ e\.speed > 1 [\d.]+ m/s$")
+        )
         page.get_by_role("tab", name="nodes").click()
         page.locator(".pattern tbody tr").first.click()
         drawn = page.locator(".timeline path.series")

@@ -23,10 +23,10 @@ from sgstore.apps.explorer._app import answered, application_of, page_of
 from sgstore.apps.explorer._guard import Guard
 from sgstore.apps.explorer._requests import fields_of, taken
 from sgstore.apps.explorer._store_reader import drawn_map, shown_picture, told_graph
-from sgstore.apps.explorer._wire import as_json, packed
+from sgstore.apps.explorer._wire import as_json, packed, told_values
 from sgstore.base.json_text import finite
 from sgstore.errors import QueryNameError, StoreError
-from sgstore.lang.help import why_not
+from sgstore.lang.help import condition_values, why_not
 from sgstore.model.vocabulary import KIND_CODE, KINDS, LIGHT_STATE_CODE, LIGHT_STATES
 from sgstore.temporal import RecentGraphs
 
@@ -71,6 +71,7 @@ ASKED: Final = {
     "GET /api/series": ("series", "attribute", "node", "other"),
     "GET /api/picture": ("picture", "seq", "channel"),
     "POST /api/parts": ("parts", "text", "binding"),
+    "POST /api/values": ("values", "text", "seq", "binding"),
     "POST /api/why": ("why", "text", "seq"),
 }
 """Request of the page → method of :class:`LiveRun`, and fields of the request."""
@@ -237,6 +238,18 @@ class LiveRun:
             The graph of this frame is no longer kept.
         """
         return told_graph(self._kept(seq).graph)
+
+    def values(self, text: str, seq: int, binding: Mapping[str, int] | None) -> dict[str, Any]:
+        """Return the values in the conditions of a pattern in a recent frame, as JSON values.
+
+        Raises
+        ------
+        QueryNameError
+            The pattern is unknown, or has no such variable.
+        StoreError
+            The graph of this frame is no longer kept.
+        """
+        return told_values(condition_values(self._query(text), self._kept(seq), binding or {}))
 
     def why(self, text: str, seq: int) -> dict[str, Any]:
         """Return the first part of a pattern that fails in a recent frame, as JSON values.

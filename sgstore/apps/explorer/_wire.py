@@ -8,17 +8,20 @@ from __future__ import annotations
 
 import json
 import struct
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from sgstore.base.json_text import json_text
+from sgstore.base.json_text import finite, json_text
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from numpy.typing import NDArray
+
+    from sgstore.lang.help import ConditionValues
 
 PAGE: Final = Path(__file__).parent / "page"
 """Folder with the files of the web page."""
@@ -50,3 +53,8 @@ def _padding(data: bytes) -> bytes:
 def as_json(value: object) -> bytes:
     """Return a value as JSON for browsers. Infinite numbers become texts, such as ``inf``."""
     return json_text(value, str).encode(errors="replace")
+
+
+def told_values(found: ConditionValues) -> dict[str, Any]:
+    """Return the values in the conditions of a pattern as JSON values, by lane and condition."""
+    return {"values": finite([[[*map(asdict, of)] for of in lane] for lane in found])}

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict
 from itertools import islice
 from typing import Any, Final
 
+from sgstore.apps.explorer._wire import told_values
 from sgstore.apps.sandbox import plain, rows_found, serve
 from sgstore.errors import QueryError
 from sgstore.lang.help import WhyNotSteps
@@ -84,8 +84,7 @@ def _told_parts(store: Store, question: dict[str, Any], _: int) -> Iterator[Repl
 def _told_values(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
     """Yield the values that the conditions of a pattern compare in a frame, by lane and condition."""
     text, frame, binding = question["text"], question["frame"], question["binding"] or {}
-    found = store.condition_values(text, frame, binding, **question["parameters"])
-    yield {"values": [[[*map(asdict, of)] for of in lane] for lane in found]}
+    yield told_values(store.condition_values(text, frame, binding, **question["parameters"]))
 
 
 def _told_why(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:

@@ -1,12 +1,11 @@
 // @ts-check
 // One clock over all that is open: the frame, whether it plays, and what the server says of it.
-import { computed, effect, signal, untracked } from "../vendor/core.js";
+import { batch, computed, effect, signal, untracked } from "../vendor/core.js";
 import * as api from "./api.js";
 import { nameOf, seqAt, stillOf, timeAt } from "./data.js";
 import {
-  again, answer, inOther, isPattern, isLost, live, matches, offline, open, openMatch, parametersOf, playing, rate,
-    reasonOf, say, seq, span,
-  retries, store, text, traces,
+  again, answer, following, inOther, isPattern, isLost, live, matches, offline, open, openMatch, parametersOf, playing,
+  rate, reasonOf, say, seq, span, retries, store, text, traces,
 } from "./state.js";
 
 /** Lanes of truth of what is open: answers of the server. */
@@ -61,7 +60,13 @@ function lanesWanted(now, query) {
 export async function refresh() {
   const now = open.value, body = now && lanesWanted(now, ""), curves = series.value;
   const found = body && (await api.json("api/parts", body).catch(() => null));
-  if (found && open.value === now) lanes.value = found;
+  if (found && open.value === now) {
+    batch(() => {
+      const known = measured.value;
+      if (known?.of === lanes.value) measured.value = known && { ...known, of: found };
+      lanes.value = found;
+    });
+  }
   if (!curves.length) return;
   const more = await Promise.all(curves.map(async (one) => ({ ...one,
     columns: (await api.columns(one.path)).columns }))).catch(() => null);
@@ -100,20 +105,25 @@ let measuring = false;
 
 /** Ask for the values of the frame that is shown: one request at a time, the next one for the frame of then. */
 async function measure() {
-  const of = lanes.peek(), at = frame.peek(), now = open.peek();
-  if (measuring || playing.peek() || offline.peek() || !now || !of) return;
+  const of = lanes.peek(), at = frame.peek(), now = open.peek(), known = measured.peek();
+  if (known?.of === of && known?.at === at) return;
+  if (measuring || playing.peek() || following.peek() || (offline.peek() && !live.peek()) || !now || !of) return;
   const body = lanesWanted(now, asked.peek());
   if (!body || !of.lanes.some((/** @type {any} */ lane) => lane.conditions.length)) return;
   measuring = true;
   try {
     const found = await api.json("api/values", { ...body, seq: at, binding: of.binding });
-    if (found.error) say(`no values: ${found.error.reason}`); else measured.value = { of, at, values: found.values };
-  } catch (error) { say(reasonOf(error)); }
+    if (found.error) say(`no values: ${found.error.reason}`);
+    measured.value = { of, at, values: found.values || [] };
+  } catch (error) {
+    say(reasonOf(error));
+    if (!isLost(error)) measured.value = { of, at, values: [] };
+  }
   measuring = false;
   if (lanes.peek() !== of || frame.peek() !== at) measure();
 }
 effect(() => {
-  lanes.value; frame.value; playing.value; retries.value;
+  lanes.value; frame.value; playing.value; following.value; retries.value;
   untracked(measure);
 });
 

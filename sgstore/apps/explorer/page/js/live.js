@@ -7,15 +7,13 @@ import { feed, feedStill, keepThumb, retry, timeAt } from "./data.js";
 import { Gallery } from "./gallery.js";
 import { Above, keys } from "./keys.js";
 import { Scene } from "./scene.js";
-import { answer, dialog, live, offline, open, playing, reasonOf, seq, span, store } from "./state.js";
+import { answer, dialog, following, live, offline, open, playing, reasonOf, seq, span, store } from "./state.js";
 import { Bars } from "./timeline.js";
 import { bytesOf, unpacked } from "./wire.js";
 
 const html = htm.bind(h);
 const TILES = 300; // events that are shown as small pictures, the last ones
 
-/** Whether the page shows the last frame as it comes. */
-const following = signal(true);
 /** What is told of each check and pattern, by name: its state, and where it was violated or found. */
 /** @typedef {{state: string, many: number, spans: number[][], open: Map<string, number[]>}} Told */
 const told = signal(/** @type {Record<string, Told>} */ ({}));
@@ -32,7 +30,7 @@ function begin(hello) {
     feedStill(hello.about.store, hello.still, hello.names);
     lost.value = false;
     if (again) { retry(); return; }
-    live.value = offline.value = true;
+    live.value = offline.value = following.value = true;
     store.value = hello.about;
     told.value = Object.fromEntries([...hello.about.checks, ...hello.about.patterns].map((name) => [name, of(name)]));
     answer.value = { ...answer.value, state: "live", matches: [] };
@@ -94,8 +92,8 @@ function Head() {
       : "live"} · ${(to + 1).toLocaleString("en")} frames${from > 0 ? `, the last ${kept.toFixed(0)} s are kept`
       : ""}</h1>
     <span class="grow"></span>
-    <button class=${following.value ? "main" : ""} aria-pressed=${following.value} onClick=${follow}>
-      ${following.value ? "Live" : "Back to live"}</button>
+    ${ended.value ? null : html`<button class=${following.value ? "main" : ""} aria-pressed=${following.value}
+      onClick=${follow}>${following.value ? "Live" : "Back to live"}</button>`}
     <button class="quiet" onClick=${() => { dialog.value = "keys"; }}><kbd>?</kbd> keys</button></header>`;
 }
 
@@ -143,7 +141,12 @@ async function run() {
     });
   events.addEventListener("frame", (event) => step(unpacked(bytesOf(event.data).buffer)));
   events.addEventListener("end",
-    (event) => { ended.value = JSON.parse(event.data); take(ended.value.events); events.close(); });
+    (event) => {
+      ended.value = JSON.parse(event.data);
+      following.value = false;
+      take(ended.value.events);
+      events.close();
+    });
   events.addEventListener("error", () => { lost.value = !ended.value; });
   // Whoever looks at another frame does not follow; whoever plays to the end does again.
   effect(() => { const at = frame.value,

@@ -55,6 +55,8 @@ export const tagged = signal(/** @type {{trace: string, first: number, last: num
 export const offline = signal(false);
 /** True of a monitor that runs; and the first and last frame of it that are kept. */
 export const live = signal(false);
+/** Whether the page shows the newest frame of a running monitor as it comes. */
+export const following = signal(false);
 export const span = signal(/** @type {[number, number]} */ ([0, 0]));
 export const theme = signal(remembered("theme"));
 
