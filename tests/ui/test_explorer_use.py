@@ -294,6 +294,7 @@ def test_coverage_is_told_in_words_pictures_and_gaps(page: Any) -> None:
     page.get_by_role("button", name="Coverage").click()
     expect(page.locator(".classes .card").first).to_contain_text("1.")
     expect(page.locator(".classes .card p").first).to_contain_text("ego")
+    expect(page.locator(".sheet")).to_contain_text("Objects farther away are not named.")
     page.get_by_role("checkbox", name="logarithmic axes").uncheck()
     expect(page.locator(".chart")).to_have_attribute("aria-label", "frames by rank, linear axes")
     held = list[Any]()

@@ -174,6 +174,8 @@ function covered(found) {
   }
   return html`<h2>Kinds of scenes, the most frequent first</h2>
     <${Chart} table=${found} x="rank" lines=${["frames"]} />
+    <p class="faint">The words name the objects near the ego, and the lanes and junctions that the ego is in.
+      Objects farther away are not named.</p>
     <${Classes} found=${found} /><${Table} table=${found} />`;
 }
 
@@ -193,7 +195,7 @@ function Classes({ found }) {
       onClick=${() => go(frame)}><${Thumb} trace=${trace} frame=${seq} />
       <h3>${rank}. <span class="grow"></span><span class="faint">
         ${frames.toLocaleString("en")} frames, ${(share * 100).toFixed(1)} %</span></h3>
-      <p>${(found.words[i] || "no entity near the ego").replace(/_/g, " ")}</p></button>`;
+      <p>${found.words[i].replace(/_/g, " ")}</p></button>`;
   })}</div>`;
 }
 
