@@ -241,7 +241,7 @@ def _values_of(verdict: Verdict) -> list[Any]:
         [(w.nodes, w.names, w.holds, [*map(_of_violation, w.violations)]) for w in witnesses],
         *(verdict.status, verdict.reason),
         None if margin is None else _of_robustness(margin),
-        verdict.absent_frames,
+        *(verdict.absent_frames, verdict.applied_frames, verdict.bindings),
     ]
 
 
@@ -249,7 +249,7 @@ def as_verdict(values: list[Any]) -> Verdict:
     """Return the verdict for a list of values from a worker process."""
     import numpy as np
 
-    check, trace, word, violations, witnesses, status, reason, margin, absent = values
+    check, trace, word, violations, witnesses, status, reason, margin, *counts = values
     return Verdict(
         check,
         trace,
@@ -262,7 +262,7 @@ def as_verdict(values: list[Any]) -> Verdict:
         None if status is None else np.array(status, np.int8),
         reason,
         None if margin is None else Robustness(*margin),
-        absent,
+        *counts,
     )
 
 

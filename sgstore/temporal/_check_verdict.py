@@ -141,6 +141,13 @@ class Verdict:
         Robustness of the check, if it has ``ROBUSTNESS``.
     absent_frames : int
         For a ``true`` verdict: number of frames with an absent entity of the check.
+    applied_frames : int or None
+        For a ``true`` verdict of ``ALWAYS (p IMPLIES q)``: number of frames in which p is true, for some
+        entities. Without ``IMPLIES``: the same for the ``WHERE`` of ``FORALL``. Otherwise ``None``, also in
+        monitors.
+    bindings : int or None
+        For a ``true`` verdict of a ``FORALL``: number of combinations of its entities, without its
+        ``WHERE``. Otherwise ``None``, also in monitors.
 
     Examples
     --------
@@ -158,6 +165,8 @@ class Verdict:
     reason: str = ""
     robustness: Robustness | None = None
     absent_frames: int = 0
+    applied_frames: int | None = None
+    bindings: int | None = None
 
     def __repr__(self) -> str:
         number = len(self.violations)
@@ -165,6 +174,7 @@ class Verdict:
         more += f" by {self.robustness.value:.3g}" if self.robustness else ""
         why = f", {self.reason}" if self.reason else ""
         away = f", {absence_text(self.absent_frames)}" if self.absent_frames else ""
+        away += f", {self.never_applied}" if self.never_applied else ""
         return f"<Verdict {self.check!r} of {self.trace!r}: {self.verdict}{more}{why}{away}>"
 
     def _repr_html_(self) -> str:
@@ -188,6 +198,22 @@ class Verdict:
         (0.0, 74.9)
         """
         return self.violations[0] if self.violations else None
+
+    @property
+    def never_applied(self) -> str:
+        """Reason why a ``true`` verdict says nothing: the check never applied. Otherwise empty.
+
+        Examples
+        --------
+        >>> text = "CHECK yields: ALWAYS (ego.speed > 90 IMPLIES EVENTUALLY[0s, 5s] ego.speed < 8)"
+        >>> next(iter(store.check(text))).never_applied
+        'never applied: its premise is true in no frame'
+        """
+        if self.bindings == 0:
+            return "never applied: no entities of its quantifiers occur"
+        if self.applied_frames == 0:
+            return "never applied: its premise is true in no frame"
+        return ""
 
     @property
     def violated(self) -> bool:
@@ -214,7 +240,7 @@ class Verdict:
 
 
 _SPAN: Final = ("from", "start", "end", "frames", "false from", "false to", "false frames")
-_COLUMNS: Final = ("check", "trace", "verdict", "who", *_SPAN)
+_COLUMNS: Final = ("check", "trace", "verdict", "applied frames", "who", *_SPAN)
 
 _MARGIN_COLUMNS: Final = ("robustness", "decided by", "in")
 
@@ -230,6 +256,7 @@ def within_range(found: Verdict, short: ShortRange) -> Verdict:
     if not reason:
         return found
     nothing = {"violations": (), "witnesses": (), "absent_frames": 0}
+    nothing |= {"applied_frames": None, "bindings": None}
     return replace(found, verdict="unknown", reason=reason, **nothing)
 
 
@@ -253,7 +280,8 @@ def verdict_rows(
 
     The columns are :func:`verdict_columns`.
     """
-    head = verdict.check, verdict.trace, verdict.verdict
+    applied = 0 if verdict.never_applied else verdict.applied_frames
+    head = verdict.check, verdict.trace, verdict.verdict, "" if applied is None else applied
     tail = margin_cells(verdict) if margin else ()
     nothing = [("",) * (len(_SPAN) + len(returned))]
     told = False

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.base.display import IN_NOTEBOOK
-from sgstore.lang.bind import not_computed, of_check
+from sgstore.lang.bind import negated, not_computed, of_check
 from sgstore.lang.help import compared_in_check
+from sgstore.lang.ir import Tense
 from sgstore.lang.library import statement
 from sgstore.lang.sql import compile_checks, entities, relation, traces_of
 from sgstore.matches import Interval, notes_in
@@ -58,7 +59,13 @@ from sgstore.temporal._known_range import ShortRange, short_ranges
 from sgstore.temporal._match_values import AT_FRAME, ReturnedValues, Stretches
 from sgstore.temporal._matches import lacking
 from sgstore.temporal._offline import PlanValues, Premises, frame_times, traces
-from sgstore.temporal._plan import kept_throughout, needs_text, plan_of_returned, plan_text
+from sgstore.temporal._plan import (
+    kept_throughout,
+    needs_text,
+    plan_of_returned,
+    plan_text,
+    premise_of,
+)
 from sgstore.temporal._premises import bindings_of, premises_of
 from sgstore.temporal._quantifiers import (
     HOLDS,
@@ -73,6 +80,7 @@ from sgstore.temporal._quantifiers import (
     levels_of,
     may_wait,
     newcomers,
+    number_of_bindings,
     waits_for_newcomers,
 )
 from sgstore.temporal._robustness import (
@@ -371,7 +379,7 @@ class StoreCheck:
         status: bool = False,
         margins: bool = False,
     ) -> None:
-        check = one.check
+        check, self._bound = one.check, one
         self._file, self._check, self._catalog = file, check, one.catalog
         self._compat, self._want_status = compat, status
         self._plan, self._formula, self._reset, self._guards = plan_of_check(check)
@@ -533,6 +541,7 @@ class StoreCheck:
         if self._premises is not None and not self._premises.left(trace.relations):
             absent = self._absences.get(trace.trace_id, 0)
             found = Verdict(self._check.name, trace.name, "true", absent_frames=absent)
+            found = self._with_application(found, trace)
             return self._with_robustness(within_range(found, short), trace)
         levels = self._levels(trace, FAVOURABLE)
         judged = self._judged(trace, levels)
@@ -560,7 +569,47 @@ class StoreCheck:
             found = replace(found, reason=self._reason(trace, strict, other))
         if word == "true":
             found = replace(found, absent_frames=self._absences.get(trace.trace_id, 0))
+            found = self._with_application(found, trace)
         return self._with_robustness(within_range(found, short), trace, levels)
+
+    def _with_application(self, found: Verdict, trace: TraceReader) -> Verdict:
+        """Return a true verdict with the numbers that show if the check applied."""
+        bindings = None
+        if self._variables and all(one.word == "FORALL" for one in self._check.quantifiers):
+            people = self._people.get(trace.trace_id, {})
+            injective, nodes = self._check.injective, self._check.scope.nodes
+            others = [people.get(n, ()) for n in nodes if injective and n not in self._variables]
+            apart = set[int]().union(*others)
+            domains = [set(people.get(name, ())) - apart for name in self._variables]
+            bindings = number_of_bindings(domains, injective=injective)
+        applied = self._applied.get(trace.trace_id)
+        return replace(found, applied_frames=applied, bindings=bindings)
+
+    @cached_property
+    def _applied(self) -> dict[int, int]:
+        """Return the number of frames in which the premise is true: trace id → frame count."""
+        premise = premise_of(self._check)
+        if premise is None:
+            return {}
+        never = Tense("ALWAYS", (negated(premise),))
+        plain: dict[str, Any] = {"reset": None, "robustness": False, "returns": (), "having": None}
+        check = replace(self._check, formula=never, gaps="break", **plain)
+        inner = StoreCheck(self._file, replace(self._bound, check=check))
+        readers = inner.readers(premises=inner._premises)
+        return {trace.trace_id: inner._false_frames(trace) for trace in readers}
+
+    def _false_frames(self, trace: TraceReader) -> int:
+        """Return the number of frames in which a check ``ALWAYS p`` has a false p, for some entities."""
+        body = always_true(self._formula)
+        if body is None or (self._premises and not self._premises.left(trace.relations)):
+            return 0
+        false = np.zeros(len(trace), np.bool_)
+        kinds, _ = self._alike(trace, innermost(self._levels(trace)))
+        for low in range(0, len(kinds), trace.together):
+            some = kinds[low : low + trace.together]
+            values = PlanValues(self._plan, trace, self._variables, some)
+            false |= ~values.formula(body).all(axis=0)
+        return int(false.sum())
 
     def _with_robustness(
         self, found: Verdict, trace: TraceReader, levels: list[Level] | None = None

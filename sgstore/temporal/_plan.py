@@ -397,6 +397,32 @@ def kept_throughout(check: b.BoundCheck) -> b.Bound | None:
     return lasting(check.formula) if every else None
 
 
+def premise_of(check: b.BoundCheck) -> b.Bound | None:
+    """Return the premise of a check that requires a condition in every frame; None without a premise.
+
+    That is the condition before ``IMPLIES``, or else the ``WHERE`` of the quantifiers.
+    """
+
+    def before(condition: b.Bound) -> b.Bound | None:
+        match condition:
+            case b.Operation("IMPLIES", (premise, _)):
+                return premise
+            case b.Operation("AND", operands):
+                found = tuple(one for one in map(before, operands) if one is not None)
+                whole = len(found) == len(operands)
+                return b.Operation("OR", found, condition.type) if whole else None
+            case _:
+                return None
+
+    body = kept_throughout(check)
+    if body is None:
+        return None
+    guards = tuple(one.where for one in check.quantifiers if one.where is not None)
+    if (premise := before(body)) is not None or not guards:
+        return premise
+    return guards[0] if len(guards) == 1 else b.Operation("AND", guards, body.type)
+
+
 def plan_of_returned(check: BoundCheck) -> Plan:
     """Return a new evaluation plan for the ``RETURN`` values of a check, without queries."""
     return Plan(query_of_check(check), variables_of(check), prefix="returned ")

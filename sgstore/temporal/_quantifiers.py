@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
+from math import prod
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -10,7 +12,7 @@ import numpy as np
 from sgstore.temporal._offline import refuse_many
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Collection, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -171,6 +173,27 @@ def waits_for_newcomers(
     due = (codes != VIOLATED) & ((codes != HOLDS) | (check.end == "pending"))
     codes = np.where(late, np.where(due, PENDING, VIOLATED), codes).astype(np.int8)
     return int(folded_values(wider, codes, HOLDS)[0][0]) != VIOLATED
+
+
+def number_of_bindings(domains: Sequence[Collection[int]], *, injective: bool) -> int:
+    """Return the number of combinations of one entity from each set.
+
+    If ``injective``, no entity occurs twice in a combination.
+    """
+    if not injective:
+        return prod(map(len, domains))
+    kinds = Counter(tuple(one in some for some in domains) for one in set().union(*domains))
+
+    def combined(at: int) -> int:
+        total = 0
+        for kind, many in list(kinds.items()) if at < len(domains) else ():
+            if kind[at] and many:
+                kinds[kind] -= 1
+                total += many * combined(at + 1)
+                kinds[kind] += 1
+        return total if at < len(domains) else 1
+
+    return combined(0)
 
 
 def may_wait(check: BoundCheck) -> bool:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import random
-from itertools import groupby
+from itertools import groupby, product
 from typing import TYPE_CHECKING
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -14,8 +15,10 @@ from recordings import car as recorded
 from thorough import LONG
 
 import sgstore
+from sgstore.apps.cli import run
 from sgstore.ingest import ingest
 from sgstore.temporal._formula import always
+from sgstore.temporal._quantifiers import number_of_bindings
 from sgstore.temporal._verdicts import Settled
 
 if TYPE_CHECKING:
@@ -41,6 +44,13 @@ def drive(folder: Path, speeds: Sequence[Speeds]) -> Store:
     path = folder / "drive.sgstore"
     ingest(path, [folder / "drive.mcap"])
     return sgstore.open(path)
+
+
+@pytest.fixture(scope="module")
+def applying(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    """The ego is fast in frames 5 to 9, another car in frames 8 to 12."""
+    speeds = [[8] * 5 + [12] * 5 + [8] * 30, [8] * 8 + [12] * 5 + [8] * 27, [8] * FRAMES]
+    return drive(tmp_path_factory.mktemp("applying"), speeds)
 
 
 def random_speeds(rng: random.Random) -> list[int]:
@@ -171,3 +181,90 @@ def test_random_conditions_are_false_where_the_textbook_says(first: int) -> None
                 assert not holds(body, [*word, *more], [*times, *after], i), (seed, i)
         open_ones += int((strong & ~weak).sum())
     assert open_ones > 50
+
+
+# Checks that never applied ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("rule", "applied", "bindings"),
+    [
+        ("ALWAYS (ego.speed > 10 IMPLIES ego.speed > 9)", 5, None),
+        ("ALWAYS (ego.speed > 90 IMPLIES ego.speed > 95)", 0, None),
+        ("ALWAYS (ONCE[0frames, 2frames] ego.speed > 10 IMPLIES ego.speed > 0)", 7, None),
+        ("ALWAYS (EVENTUALLY[0frames, 2frames] ego.speed > 10 IMPLIES ego.speed > 0)", 7, None),
+        (
+            "ALWAYS ((ego.speed > 90 IMPLIES ego.x < 0) AND (ego.speed < 9 IMPLIES ego.x < 99))",
+            35,
+            None,
+        ),
+        (
+            "ALWAYS (ego.speed > 90 IMPLIES ego.x < 0) AND ALWAYS (ego.speed > 10 IMPLIES ego.x < 99)",
+            5,
+            None,
+        ),
+        ("USING GAPS unknown CHECK ALWAYS (ego.speed > 10 IMPLIES ego.speed > 9)", 5, None),
+        ("FORALL (v:Car) ALWAYS (v.speed > 10 IMPLIES v.speed < 15)", 8, 3),
+        ("FORALL (v:Car) ALWAYS (v.speed > 10 IMPLIES EVENTUALLY v.speed < 15)", 8, 3),
+        ("FORALL (v:Car WHERE v.speed > 11) ALWAYS v.speed < 15", 8, 3),
+        ("FORALL (v:Car WHERE v.speed > 90) ALWAYS v.speed < 15", 0, 3),
+        ("FORALL (v:Car WHERE v.speed > 90) ALWAYS (v.speed > 10 IMPLIES v.speed < 15)", 0, 3),
+        ("FORALL (v:Car, w:Vehicle) ALWAYS dist(v, w) > 1", None, 6),
+        ("FORALL (v:Car) ALWAYS dist(ego, v) > 1", None, 2),
+        ("FORALL (v:Car) ALWAYS (v.speed > 10 IMPLIES dist(ego, v) > 1)", 5, 2),
+        ("FORALL (p:Person) ALWAYS gap(ego, p) > 1", None, 0),
+        ("ALWAYS ego.speed < 20", None, None),
+        ("FORSOME (v:Car) ALWAYS v.speed < 20", None, None),
+    ],
+)
+def test_a_true_verdict_tells_how_often_the_check_applied(
+    applying: Store, rule: str, applied: int | None, bindings: int | None
+) -> None:
+    (verdict,) = applying.check(rule if rule.startswith("USING") else f"CHECK {rule}")
+
+    assert verdict.verdict == "true"
+    assert (verdict.applied_frames, verdict.bindings) == (applied, bindings)
+    assert bool(verdict.never_applied) == (0 in {applied, bindings})
+
+
+def test_a_false_verdict_has_no_count(applying: Store) -> None:
+    (verdict,) = applying.check("CHECK ALWAYS (ego.speed > 10 IMPLIES ego.speed > 15)")
+
+    assert (verdict.applied_frames, verdict.bindings, verdict.never_applied) == (None, None, "")
+
+
+@pytest.mark.parametrize("seed", range(200 if LONG else 20))
+def test_combinations_of_entities_are_counted_as_they_are_listed(seed: int) -> None:
+    rng = random.Random(seed)
+    domains = [{n for n in range(5) if rng.random() < 0.6} for _ in range(rng.randint(1, 4))]
+    every = [*product(*domains)]
+
+    assert number_of_bindings(domains, injective=False) == len(every)
+    apart = [one for one in every if len({*one}) == len(one)]
+    assert number_of_bindings(domains, injective=True) == len(apart)
+
+
+def test_check_prints_which_rules_never_applied(
+    applying: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (
+        "CHECK rare: ALWAYS (ego.speed > 90 IMPLIES ego.speed > 95);"
+        "CHECK nobody: FORALL (p:Person) ALWAYS gap(ego, p) > 1;"
+        "CHECK often: ALWAYS (ego.speed > 10 IMPLIES ego.speed > 9)"
+    )
+    junit = tmp_path / "junit.xml"
+
+    assert run(["check", str(applying.file.path), "-e", text, "--junit", str(junit)]) == 0
+
+    out, err = capsys.readouterr()
+    _, _, *rows = out.splitlines()
+    assert [row.split() for row in rows] == [
+        ["rare", "drive", "true", "0"],
+        ["nobody", "drive", "true", "0"],
+        ["often", "drive", "true", "5"],
+    ]
+    assert "rare is true of drive: never applied: its premise is true in no frame" in err
+    assert "nobody is true of drive: never applied: no entities" in err
+    assert "often" not in err
+    cases = ElementTree.parse(junit).getroot().findall("*/testcase")
+    assert [bool(case.findtext("system-out")) for case in cases] == [True, True, False]

@@ -233,7 +233,13 @@ def _reported(
 
     ``failing``: the verdicts that change the exit code.
     """
-    from sgstore.temporal import absence_text, columns_returned, verdict_columns, verdict_rows
+    from sgstore.temporal import (
+        absence_text,
+        columns_returned,
+        unknown_notes,
+        verdict_columns,
+        verdict_rows,
+    )
 
     if explain:
         typer.echo(run.explain())
@@ -246,7 +252,7 @@ def _reported(
 
     def counted() -> Iterator[Verdict]:
         for verdict in run:
-            if files or verdict.reason:
+            if files or verdict.reason or verdict.never_applied:
                 kept.append(verdict)
             if verdict.absent_frames:
                 absent[verdict.check] = absent.get(verdict.check, 0) + verdict.absent_frames
@@ -271,6 +277,7 @@ def _reported(
         )
         ask.write((*_DOCUMENT, *more), told)
     say_unknown((one.check, one.trace, one.reason) for one in kept)
+    say_notes(unknown_notes((f"{one.check} is true", one.trace, one.never_applied) for one in kept))
     for one, frames in absent.items():
         say(f"{one} is true, and {absence_text(frames)}")
     files.write(kept)
@@ -301,6 +308,8 @@ _DOCUMENT: Final = (
     "violations",
     "witnesses",
     "absent_frames",
+    "applied_frames",
+    "bindings",
 )
 """Column names of verdicts in output for programs."""
 
@@ -318,7 +327,8 @@ def _document(verdict: Verdict, returned: Sequence[str]) -> tuple[Any, ...]:
         for one in verdict.witnesses
     ]
     head = verdict.check, verdict.trace, verdict.verdict, verdict.reason or None
-    return (*head, spans[0] if spans else None, spans, witnesses, verdict.absent_frames)
+    counts = verdict.absent_frames, verdict.applied_frames, verdict.bindings
+    return (*head, spans[0] if spans else None, spans, witnesses, *counts)
 
 
 def margin_document(verdict: Verdict) -> dict[str, Any] | None:

@@ -82,8 +82,10 @@ def write_junit(path: Path, verdicts: Iterable[Verdict], evidence: Evidence) -> 
             Xml.SubElement(case, "failure", message=count).text = "\n".join(lines)
         elif one.verdict != "true":
             Xml.SubElement(case, "skipped", message=_plain(one.reason or _word(one)))
-        elif one.absent_frames:
-            Xml.SubElement(case, "system-out").text = absence_text(one.absent_frames)
+        elif one.absent_frames or one.never_applied:
+            absent = absence_text(one.absent_frames) if one.absent_frames else ""
+            told = "; ".join(filter(None, [absent, one.never_applied]))
+            Xml.SubElement(case, "system-out").text = told
     for element, cases in [(root, root.findall("*/*")), *((s, list(s)) for s in suites.values())]:
         element.set("tests", str(len(cases)))
         element.set("failures", str(sum(case.find("failure") is not None for case in cases)))

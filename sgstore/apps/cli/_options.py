@@ -280,15 +280,8 @@ def _advise(error: Any, verb: Verb, ctx: Any, args: list[str]) -> None:
     name = getattr(error, "option_name", "")
     if type(error).__name__ == "NoSuchOption":
         error.possibilities = None
-        known = _words_of(verb)
-        limits = "--limit", *_OPTIONS_OF_OTHERS["--limit"]
-        if name in limits and "--format" in known and "--limit" not in known:
-            every = f"{verb.name} prints all rows; '| head' shows the first, -o FILE writes all"
-            error.message = f"No such option: {name}; {every}"
-        elif line := _option_instead(verb, ctx, args, name):
-            error.message = f"No such option: {name}; write: {line}"
-        elif others := _commands_with(ctx.find_root().command, name):
-            error.message = f"No such option: {name}; it is an option of: {', '.join(others)}"
+        if advice := _option_advice(verb, ctx, args, name):
+            error.message = f"No such option: {name}; {advice}"
     stores = [one for one in args if _is_database(one)] if _places(verb) else []
     if len(stores) > 1 and "extra argument" in str(getattr(error, "message", "")):
         error.message = _several_stores(ctx, stores)
@@ -304,6 +297,18 @@ def _advise(error: Any, verb: Verb, ctx: Any, args: list[str]) -> None:
             error.message = "Write the store first."
         elif "\n" in (text := error.format_message()):  # a line for each choice
             raise typer.BadParameter(" ".join(text.split()), ctx=ctx) from None
+
+
+def _option_advice(verb: Verb, ctx: Any, args: list[str], name: str) -> str:
+    """Return advice for an unknown option, or an empty text."""
+    known = _words_of(verb)
+    limits = "--limit", *_OPTIONS_OF_OTHERS["--limit"]
+    if name in limits and "--format" in known and "--limit" not in known:
+        return f"{verb.name} prints all rows; '| head' shows the first, -o FILE writes all"
+    if line := _option_instead(verb, ctx, args, name):
+        return f"write: {line}"
+    others = _commands_with(ctx.find_root().command, name)
+    return f"it is an option of: {', '.join(others)}" if others else ""
 
 
 def _several_stores(ctx: Any, stores: Sequence[str]) -> str:
