@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 from test_lang_golden import CATALOG
@@ -235,3 +236,36 @@ def test_an_edge_without_braces_after_forall_needs_exists(text: str) -> None:
 )
 def test_unknown_relation_names_the_predicate_of_its_name(name: str, hint: str) -> None:
     assert refused(f"MATCH (e:Ego)-[:{name}]->(v)").hint == hint
+
+
+NO_EGO = "so (:Ego) in braces matches nothing there"
+
+
+@pytest.mark.parametrize(
+    ("text", "noted"),
+    [
+        ("MATCH (v:Car) WHERE NOT EXISTS {(e:Ego)-[:near]->(v)}", True),
+        ("MATCH (v:Car) WHERE NOT EXISTS {(e:Ego)}", True),
+        ("MATCH (v:Car) RETURN COUNT {(e:Ego)-[:near]->(v)} AS n", True),
+        ("MATCH (v:Car) WHERE NOT EXISTS {(p:Person) WHERE EXISTS {(:Ego)-[:near]->(p)}}", True),
+        ("MATCH (v:Car) WHERE NOT EXISTS {(e:Ego)-[:near]->(v)} THEN MATCH (v:Car)", True),
+        ("MATCH (v:Car) WHERE prev(v.speed) > 3 AND NOT EXISTS {(e:Ego)-[:near]->(v)}", True),
+        ("MATCH (v:Car) WHERE NOT EXISTS {(w:Car)-[:near]->(v)}", False),
+        ("MATCH (v:Car) WHERE NOT EXISTS {(ego)-[:near]->(v)}", False),
+        ("MATCH (e:Ego), (v:Car) WHERE NOT EXISTS {(o:Ego)-[:near]->(v)}", False),
+    ],
+)
+def test_ego_in_braces_has_a_note_on_traces_without_an_ego(text: str, noted: bool) -> None:
+    trace, *_ = CATALOG.traces
+    names = dict(enumerate(("with", "without", "neither"), 1))
+    egos = {1: "7", 2: "", 3: ""}
+    traces = tuple(replace(trace, trace_id=n, name=names[n], ego=egos[n]) for n in names)
+
+    def notes(*chosen: int) -> list[str]:
+        catalog = replace(CATALOG, traces=traces, only=frozenset(chosen))
+        return [one for one in compile_query(text, catalog).bound.doubts if NO_EGO in one]
+
+    assert notes(1) == []
+    one = [f"1 trace has no ego, {NO_EGO}: without"]
+    assert notes(1, 2) == one * noted
+    assert notes(1, 2, 3) == [f"2 traces have no ego, {NO_EGO}: without, neither"] * noted

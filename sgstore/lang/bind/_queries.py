@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
+from sgstore.base.display import excerpts
 from sgstore.errors import QueryError, TextSpan
 from sgstore.lang import ir as b
 from sgstore.lang.bind._datasets import asked
@@ -26,7 +27,7 @@ from sgstore.lang.syntax import tree as s
 from sgstore.model.vocabulary import entity_kinds, normalize_name
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from sgstore.lang.catalog import Catalog
 
@@ -89,7 +90,7 @@ def bind_query(
     query = _of_match(match, session)
     refuse_unused(session)
     refuse_strange(session, catalog)
-    session.doubts += _merged_names(query, catalog)
+    session.doubts += [*_merged_names(query, catalog), *_absent_egos(query, catalog)]
     return replace(
         query,
         relations=frozenset(session.relations),
@@ -127,6 +128,36 @@ def _merged_names(query: b.Query, catalog: Catalog) -> list[str]:
                 " add trace.name"
             ]
     return []
+
+
+def _absent_egos(query: b.Query, catalog: Catalog) -> list[str]:
+    """If braces name an ego, return a note on the traces without one. Their pattern matches nothing there."""
+    nodes = (node for scope in query.required for node in scope.nodes.values())
+    if any(_is_ego(node) for node in nodes):
+        return []  # traces without an ego are left out, with this reason
+    values = [value for scope in query.patterns for value in scope.where]
+    values += [value for step in query.steps for value in step.when]
+    inside = (block.scope for block in _blocks([*values, *query.result.values]))
+    if not any(_is_ego(node) for scope in inside for node in scope.nodes.values()):
+        return []
+    traces = [one for one in catalog.traces if catalog.only is None or one.trace_id in catalog.only]
+    names = [one.name for one in traces if not one.ego]
+    if not names:
+        return []
+    said = "trace has no ego" if len(names) == 1 else "traces have no ego"
+    return [f"{len(names)} {said}, so (:Ego) in braces matches nothing there: {excerpts(names)}"]
+
+
+def _is_ego(node: b.Node) -> bool:
+    return bool(node.kinds.ego) and not node.kinds.other
+
+
+def _blocks(values: Iterable[b.Bound]) -> Iterator[b.BlockValue]:
+    """Yield all patterns in braces, also those inside others."""
+    for part in (part for value in values for part in b.walk(value)):
+        if isinstance(part, b.BlockValue):
+            yield part
+            yield from _blocks(part.inside)
 
 
 def _is_entity(query: b.Query, node: str) -> bool:
