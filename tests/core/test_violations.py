@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import random
 from itertools import groupby, product
 from typing import TYPE_CHECKING
@@ -134,6 +135,26 @@ def test_a_violation_names_the_frame_of_its_trigger(tmp_path: Path) -> None:
     (run,) = violation.false_runs
     assert (run.start_seq, run.end_seq, run.frames) == (5, 9, 5)
     assert (run.start, run.end) == (pytest.approx(0.5), pytest.approx(0.9))
+
+
+def test_reports_show_how_long_the_condition_is_false(
+    applying: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    junit, sarif = tmp_path / "junit.xml", tmp_path / "found.sarif"
+    line = ["check", str(applying.file.path), f"CHECK {ANSWER}"]
+
+    assert run([*line, "--junit", str(junit), "--sarif", str(sarif)]) == 0
+    table = capsys.readouterr().out
+    assert run([*line, "--json"]) == 0
+
+    told = "condition false from 0.500 to 0.900 s, in 5 frames"
+    assert told in ElementTree.parse(junit).getroot().findtext(".//failure", "")
+    (result,) = json.loads(sarif.read_text())["runs"][0]["results"]
+    assert result["message"]["text"].endswith(told)
+    assert table.splitlines()[-1].split()[-3:] == ["0.5", "0.9", "5"]
+    (verdict,) = json.loads(capsys.readouterr().out)
+    (one,) = verdict["violations"][0]["false_runs"]
+    assert (one["start_seq"], one["end_seq"], one["frames"]) == (5, 9, 5)
 
 
 def test_rules_without_a_condition_of_each_frame_have_no_false_runs(tmp_path: Path) -> None:

@@ -289,6 +289,9 @@ def test_verdicts_are_those_of_one_store(store: Store, whole: Collection, text: 
     assert [one.witnesses for one in found] == [one.witnesses for one in expected]
     assert [one.statuses for one in found] == [one.statuses for one in expected]
     assert [one.robustness for one in found] == [one.robustness for one in expected]
+    for one, other in zip(found, expected, strict=True):
+        assert [v.false_runs for v in one.violations] == [v.false_runs for v in other.violations]
+        assert (one.applied_frames, one.bindings) == (other.applied_frames, other.bindings)
 
 
 def test_processes_answer_as_this_one_does(
