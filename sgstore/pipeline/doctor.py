@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from array import array
+from collections import defaultdict
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,6 +19,11 @@ from sgstore.model.world import BUCKET_FRAMES, TraceReport
 from sgstore.pipeline.plausibility import Plausibility
 from sgstore.pipeline.recording_ingest import TraceTally
 from sgstore.readers import on_map, open_recording, open_trace
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from sgstore.model.world import Ints
 
 
 @dataclass(slots=True)
@@ -34,8 +40,9 @@ class Examination:
     digest : str
         SHA-256 of the file; empty if the file was not fully read.
     channels : list of dict
-        ``topic``, ``schema``, ``message_encoding``, ``messages`` (number of readable messages) and ``role`` of
-        each: ``ground_truth``, ``map``, ``payload``, or empty without a matching reader.
+        ``topic``, ``schema``, ``message_encoding``, ``messages`` (number of readable messages), ``role``
+        (``ground_truth``, ``map``, ``payload``, or empty without a matching reader) and, by log times,
+        ``rate``, ``period`` and ``largest_gap`` of each.
     ego : str
         The simulator's id of the ego; empty without an ego.
     road_map : str
@@ -43,6 +50,10 @@ class Examination:
     frames, states : int
     seconds : float
         Time from the first to the last frame; s.
+    rate : float or None
+        Mean number of frames per second; Hz. ``None`` for fewer than two frames.
+    period, largest_gap : float or None
+        Median and largest time between two frames; s.
     noise : float
         Noise of the positions; m. 0: exact.
     entities : dict
@@ -74,6 +85,9 @@ class Examination:
     frames: int = 0
     states: int = 0
     seconds: float = 0.0
+    rate: float | None = None
+    period: float | None = None
+    largest_gap: float | None = None
     noise: float = 0.0
     entities: dict[str, int] = field(default_factory=dict[str, int])
     unknown_types: dict[str, int] = field(default_factory=dict[str, int])
@@ -123,40 +137,59 @@ def examine(
     return found
 
 
-def _channels(found: Examination, report: TraceReport) -> Counter[int]:
-    """Add the channels of a recording to the report; return the number of readable messages by channel id."""
-    counts: Counter[int] = Counter()
+def _channels(found: Examination, report: TraceReport) -> dict[int, dict[str, Any]]:
+    """Add the channels of a recording to the report.
+
+    Returns
+    -------
+    dict
+        Channel id → ``messages`` (number of readable messages), and :func:`_rates` by log times.
+    """
+    times: defaultdict[int, array[int]] = defaultdict(lambda: array("q"))
     recording = open_recording(found.path)
+    measured: dict[int, dict[str, Any]] = {}
     try:
         found.size = recording.size
         try:
             for run in recording.walk(report):
-                ids, numbers = np.unique(run.channel, return_counts=True)
-                counts.update(dict(zip(ids.tolist(), numbers.tolist(), strict=True)))
+                for number in np.unique(run.channel).tolist():
+                    times[number].frombytes(run.log_time_ns[run.channel == number].tobytes())
         finally:
             schemas = recording.schemas
-            found.channels = [
-                {
+            for number, one in sorted(recording.channels.items()):
+                logged = np.sort(np.frombuffer(times[number], np.int64))
+                measured[number] = {"messages": len(logged), **_rates(logged)}
+                told = {
                     "topic": one.topic,
                     "schema": schemas[one.schema_id].name if one.schema_id in schemas else "",
                     "message_encoding": one.message_encoding,
-                    "messages": counts[number],
                     "role": "",
                 }
-                for number, one in sorted(recording.channels.items())
-            ]
+                found.channels.append(told | measured[number])
     finally:
         recording.close()
-    return counts
+    return measured
 
 
-def _read(found: Examination, config: Config, maps: Maps, counts: Counter[int]) -> None:
+def _rates(time_ns: Ints) -> dict[str, float | None]:
+    """Return mean rate (Hz), median period and largest gap (s) of times; ``None`` if they do not differ."""
+    steps = np.diff(time_ns) / 1e9
+    if not (seconds := float(steps.sum())) > 0:
+        return {"rate": None, "period": None, "largest_gap": None}
+    period, gap = float(np.median(steps)), float(steps.max())
+    return {"rate": round(len(steps) / seconds, 6), "period": period, "largest_gap": gap}
+
+
+def _read(
+    found: Examination, config: Config, maps: Maps, measured: Mapping[int, Mapping[str, Any]]
+) -> None:
     with open_trace(found.path, ego=config.ego, mapping=config.mapping) as trace:
         info = trace.info
         found.flavour, found.digest, found.ego = info.flavour, info.digest, info.ego
-        names = ("topic", "schema", "message_encoding", "messages", "role")
+        names = ("topic", "schema", "message_encoding", "role")
+        nothing = {"messages": 0, **_rates(np.zeros(0, np.int64))}
         found.channels = [
-            {name: counts[one.id] if name == "messages" else getattr(one, name) for name in names}
+            {**{name: getattr(one, name) for name in names}, **measured.get(one.id, nothing)}
             for one in info.channels
         ]
         used, odd = maps.of(info)
@@ -169,7 +202,8 @@ def _read(found: Examination, config: Config, maps: Maps, counts: Counter[int]) 
                 tally.see(block)
         finally:
             report = trace.report
-            for name, value in tally.as_dict().items():
+            times = np.sort(np.frombuffer(tally.times, np.int64))
+            for name, value in (tally.as_dict() | _rates(times)).items():
                 setattr(found, name, value)
             found.frames, found.states, found.seconds = tally.frames, report.states, tally.seconds
             found.unknown_types = config.unknown_of(report.unknown_types)

@@ -40,7 +40,7 @@ class Hurt(NamedTuple):
 
 FILES = {
     "clock_jump": Hurt(
-        200, odd="the log clock steps back by 4.91 s before message 121 of /carla/status: 2 passes"
+        200, odd="the log clock steps back by 4.91 s before message 121 of /carla/status"
     ),
     "cut_mid_chunk": Hurt(99, lost="the file ends inside a chunk"),
     "flipped_chunk": Hurt(167, lost="the chunk cannot be decompressed"),

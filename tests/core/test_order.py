@@ -6,6 +6,8 @@ import os
 import random
 import tracemalloc
 from collections.abc import Callable
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -469,3 +471,27 @@ def test_parts_that_do_not_overlap_are_merely_unsorted(tmp_path: Path) -> None:
         for t in (9.0, *(i / 10 for i in range(80))):  # one message is written too early
             recorder.ground_truth(t, [recordings.car(1, x=t)], host=1)
     assert read(path).passes is None
+
+
+def test_doctor_measures_rates(tmp_path: Path) -> None:
+    """Frames every 0.1 s with a gap of 1 s; a camera at half their rate; a map with one message."""
+    path = tmp_path / "rates.mcap"
+    with recordings.Recorder(path) as recorder:
+        recorder.map("<OpenDRIVE/>")
+        for i in range(21):
+            t = i / 10 + (0.9 if i > 10 else 0)
+            recorder.ground_truth(t, [recordings.car(1, x=t)], host=1)
+            if i % 2 == 0:
+                recorder.camera(t)
+    found = examine(path)
+    names = ("rate", "period", "largest_gap")
+    frames = [found.as_dict()[name] for name in names]
+    assert frames == pytest.approx([20 / 2.9, 0.1, 1.0])
+    of = {one["topic"]: [one[name] for name in names] for one in found.channels}
+    assert of["truth"] == pytest.approx(frames)
+    assert of["camera"] == pytest.approx([10 / 2.9, 0.2, 1.1])
+    assert [None] * 3 in of.values()
+    text = StringIO()
+    with redirect_stdout(text):
+        run(["doctor", str(path)])
+    assert text.getvalue().count("6.897 Hz, median period 0.1 s, largest gap 1 s") == 2

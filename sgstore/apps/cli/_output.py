@@ -527,7 +527,7 @@ def _facts(values: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "flavour", values.get("flavour", "")
     yield "ego", values.get("ego", "")
     yield "road map", values.get("map", "") or values.get("road_map", "")
-    yield "frames", _frames(values)
+    yield "frames", ", ".join(filter(None, (_frames(values), _rates(values))))
     yield "part", _part(values)
     yield "entities", _counts(values.get("entities", {}))
     yield "unknown types", _counts(values.get("unknown_types", {}))
@@ -626,13 +626,22 @@ def _channels(channels: Iterable[dict[str, Any]]) -> Iterator[str]:
             channel["schema"] or channel["message_encoding"] or "no schema",
             channel.get("role") or "",
             number_of(channel["messages"], "message") if channel.get("messages", -1) >= 0 else "",
+            _rates(channel),
         )
         for channel in channels
     ]
-    widths = [max(len(row[i]) for row in rows) for i in range(4)]
+    widths = [max(len(row[i]) for row in rows) for i in range(5)]
     for row in rows:
         cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
         yield GAP.join(cells).rstrip()
+
+
+def _rates(values: dict[str, Any]) -> str:
+    """Return rate, median period and largest gap of a channel or of frames as text."""
+    if values.get("rate") is None:
+        return ""
+    gap = f"largest gap {values['largest_gap']:.4g} s"
+    return f"{values['rate']:.4g} Hz, median period {values['period']:.4g} s, {gap}"
 
 
 def _amount(size: int) -> str:
