@@ -355,6 +355,10 @@ def _published(
         outcome = outcomes[number]
         if isinstance(name, str):
             outcome.name, outcome.status = name, "added" if known[number] is None else "replaced"
+            if file and (taken := outcome.taken_name):
+                trace = file.trace(taken)
+                same = trace.digest == ready[number].identity.digest
+                outcome.other = trace.ego if same else ""
         elif isinstance(name, PresentError):  # the same recording twice in one run
             same = (outcome.path, "present", name.name, outcome.ego, outcome.frames)
             outcomes[number] = TraceOutcome(*same, seconds=outcome.seconds)

@@ -107,6 +107,8 @@ class TraceOutcome:
         Unusable parts of the recording.
     scope : dict
         Number of states cut by the settings, as in the report of the trace; empty if it failed.
+    other : str
+        Ego of the trace that has the plain name, if it is from the same recording.
     error : SgstoreError or None
         Reason of the failure.
     """
@@ -124,12 +126,20 @@ class TraceOutcome:
     warnings: list[str] = field(default_factory=list[str])
     losses: list[Loss] = field(default_factory=list[Loss])
     scope: dict[str, Any] = field(default_factory=dict[str, Any])
+    other: str = ""
     error: SgstoreError | None = None
 
     def __repr__(self) -> str:
         about = f"{number_of(self.frames, 'frame')}, {number_of(len(self.losses), 'loss', 'es')}"
         about = str(self.error) if self.error else about
         return f"<TraceOutcome {self.name or self.path.name!r}: {self.status}, {about}>"
+
+    @property
+    def taken_name(self) -> str:
+        """If a trace was renamed because its name was taken, the taken name; otherwise empty."""
+        name, _, number = self.name.rpartition("~")
+        renamed = self.status == "added" and self.name != self.path.stem
+        return name if renamed and number.isdecimal() else ""
 
     def as_dict(self) -> dict[str, Any]:
         """Return the result of an ingest as JSON values; :meth:`from_dict` is the inverse."""

@@ -277,6 +277,23 @@ def test_an_ingest_reports_a_trace_that_cannot_have_the_name_of_its_file(tmp_pat
     assert [line in one for one in said] == [False, True, False]
 
 
+def test_an_ingest_for_another_ego_explains_the_second_trace(tmp_path) -> None:
+    store, path = tmp_path / "s.db", drive(tmp_path / "drive.mcap", frames=3)
+    said = [
+        sgstore("ingest", store, path, *more).stderr.decode()
+        for more in ((), ("--ego", "3"), ("--ego", "3"))
+    ]
+
+    reason = "stored as 'drive~2', beside 'drive', the same recording with the ego 'Ego'"
+    remedy = f"sgstore remove {store} drive"
+    assert [f"{reason}; to keep only one of them: {remedy}\n" in one for one in said] == [
+        *(False, True, False)
+    ]
+    assert sgstore(*remedy.split()[1:]).returncode == 0
+    names = json.loads(sgstore("info", store, "--json").stdout)
+    assert [(one["trace"], one["ego"]) for one in names] == [("drive~2", "3")]
+
+
 # sql
 
 

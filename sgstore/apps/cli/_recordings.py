@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 from collections import Counter
 from contextlib import contextmanager
@@ -118,19 +119,21 @@ def ingest(
                 on_progress=on_progress,
                 **options,
             )
-    return _report_outcomes(outcomes, out)
+    return _report_outcomes(outcomes, out, store)
 
 
-def _report_outcomes(outcomes: list[TraceOutcome], out: PrintedRows) -> int:
+def _report_outcomes(outcomes: list[TraceOutcome], out: PrintedRows, store: Path) -> int:
     """Print the result of an ingest for each recording, and return the exit code."""
     first = {outcome.path: outcome for outcome in reversed(outcomes)}
     for outcome in outcomes:
         _say_warnings(outcome)
-        if outcome is first[outcome.path] and (taken := _taken_name(outcome)):
-            say(
-                f"{place_named(outcome.path)}: stored as {outcome.name!r}, because the store has"
-                f" another trace {taken!r}"
-            )
+        if outcome is first[outcome.path] and (taken := outcome.taken_name):
+            reason = f"because the store has another trace {taken!r}"
+            if outcome.other:
+                reason = f"beside {taken!r}, the same recording with the ego {outcome.other!r}"
+                remedy = shlex.join(["sgstore", "remove", place_named(store), taken])
+                reason += f"; to keep only one of them: {remedy}"
+            say(f"{place_named(outcome.path)}: stored as {outcome.name!r}, {reason}")
     code = ERROR if any(outcome.error for outcome in outcomes) else 0
     if out.for_people:  # an error is no row
         outcomes = [outcome for outcome in outcomes if not outcome.error]
@@ -148,13 +151,6 @@ def _report_outcomes(outcomes: list[TraceOutcome], out: PrintedRows) -> int:
     more = ("scope", "warnings", "error", "losses_at")
     out.write(*_with_more(columns, rows, reports, more, out), totals=totals)
     return code or (LOSS if any(outcome.losses for outcome in outcomes) else 0)
-
-
-def _taken_name(outcome: TraceOutcome) -> str:
-    """If a trace was renamed because its name was taken, return the taken name; otherwise an empty text."""
-    name, _, number = outcome.name.rpartition("~")
-    renamed = outcome.status == "added" and outcome.name != outcome.path.stem
-    return name if renamed and number.isdecimal() else ""
 
 
 def _say_scope(reports: Iterable[Mapping[str, Any]], out: PrintedRows) -> None:
