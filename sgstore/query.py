@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import copy
 import io
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, overload
 
 from sgstore.base.display import IN_NOTEBOOK
 from sgstore.base.plugins import VERBS
-from sgstore.errors import StoreError, place_named, url_named
+from sgstore.errors import QueryError, StoreError, place_named, url_named
 from sgstore.lang.library import require_sql, statement
 from sgstore.lang.sql import CONSTANTS, about_frame, compile_query, union_parts
 from sgstore.matches import UnionMatches
@@ -33,7 +35,7 @@ if TYPE_CHECKING:
     from sgstore.lang.help import ConditionValues, WhyNot, WhyNotSteps
     from sgstore.lang.ir import Query
     from sgstore.lang.memory import FrameView
-    from sgstore.lang.sql import UnionParts
+    from sgstore.lang.sql import Compiled, UnionParts
     from sgstore.lang.syntax import Pattern
     from sgstore.matches import Interval, Matches
     from sgstore.model.world import Clip
@@ -1532,7 +1534,8 @@ class Store(StoreVerbs):
         Returns
         -------
         WhyNot or WhyNotSteps
-            For a sequence: one answer per step.
+            For a sequence: one answer per step, the number of frames of the trace in which each step
+            holds, and the steps that never follow the step before.
 
         Raises
         ------
@@ -1549,6 +1552,7 @@ class Store(StoreVerbs):
         """
         from sgstore.lang.help import (
             WhyNot,
+            WhyNotSteps,
             why_not,  # imports numpy: only on demand
         )
 
@@ -1567,10 +1571,38 @@ class Store(StoreVerbs):
                 )
             view = self._view(ref, compiled.bound)
             answer = why_not(compiled.bound, view, compiled.text)
-            if isinstance(answer, WhyNot) and answer.failed.startswith("topic("):
+            if isinstance(answer, WhyNotSteps):
+                return self._why_not_in_time(answer, compiled, ref, values)
+            if answer.failed.startswith("topic("):
                 reason = self.find(text, **values).reasons.get(ref.trace)
                 return replace(answer, found=reason or answer.found)
             return answer
+
+    def _why_not_in_time(
+        self, answer: WhyNotSteps, compiled: Compiled, ref: FrameRef, values: Mapping[str, Any]
+    ) -> WhyNotSteps:
+        """Test each step of a sequence in all frames of the trace, and each step with the step before it."""
+        text, query = compiled.text, compiled.bound
+        (lanes,) = self.find(text, **values).parts_each([(ref.trace, ref.seq, {})])
+        frames = tuple(
+            sum(last - first + 1 for first, last in lanes.together(number))
+            for number in range(1, len(query.steps) + 1)
+        )
+        head = text[: query.steps[0].span.start].strip()
+        head = f"{head}, DATASET '{ref.trace}'" if head else f"USING DATASET '{ref.trace}'"
+        apart: list[tuple[int, str]] = []
+        for number, (one, other) in enumerate(pairwise(query.steps), start=2):
+            plain = not (query.alternatives or one.absent or other.absent or "'" in ref.trace)
+            if not (plain and frames[number - 2] and frames[number - 1]):
+                continue
+            both = f"{head} {text[one.span.start : other.span.end]} RETURN FRAMES"
+            known = {name: value for name, value in values.items() if f"${name}" in both}
+            # The pair may lack labels of earlier steps. It then holds more often than in the sequence.
+            with suppress(QueryError):
+                if not self.find(both, **known).count():
+                    link = " ".join(text[one.span.end : other.span.start].split())
+                    apart.append((number, link))
+        return replace(answer, trace=ref.trace, frames=frames, apart=tuple(apart))
 
     def parts(
         self,

@@ -152,6 +152,30 @@ def test_why_not_and_explain_name_the_stages(store: Store) -> None:
     assert "with each e, count(v) AS n\n  where (n > 1)" in explained
 
 
+def test_why_not_tests_the_steps_of_a_sequence_in_all_frames(store: Store) -> None:
+    """The ego drives along the x axis."""
+    places = [row[0] for row in store.find("MATCH (e:Ego) RETURN e.x ORDER BY frame.t").rows()]
+    late, early, never = places[-2], places[1], places[-1] + 1
+    text = (
+        f"MATCH (e:Ego) WHERE e.x >= {late} THEN WITHIN 9s MATCH (e:Ego) WHERE e.x <= {early}"
+        f" THEN MATCH (e:Ego) WHERE e.x > {never}"
+    )
+
+    why: Any = store.why_not("run#3", text)
+
+    assert (why.trace, why.frames, why.apart) == ("run", (2, 2, 0), ((2, "THEN WITHIN 9s"),))
+    lines = str(why).splitlines()[-4:]
+    assert lines == [
+        "step 1 holds in 2 frames of run",
+        "step 2 holds in 2 frames of run",
+        "step 3 holds in no frame of run",
+        "step 2 never follows step 1 in run: THEN WITHIN 9s",
+    ]
+    assert why.as_dict()["apart"] == [{"step": 2, "link": "THEN WITHIN 9s"}]
+    turned = f"MATCH (e:Ego) WHERE e.x <= {early} THEN MATCH (e) WHERE e.x >= {late}"
+    assert store.why_not("run#3", turned).as_dict()["apart"] == []
+
+
 def test_monitor_reports_start_of_staged_matches() -> None:
     """Three cars stand behind one another; in the third frame one is gone, and one id returns far away."""
     monitor = Monitor(

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final
 
+from sgstore.base.display import number_of
 from sgstore.lang import ir as b
 from sgstore.lang.help._pattern_parts import parts_of
 from sgstore.lang.help._pattern_text import Writer, joined_calls, kind_label, text_written
@@ -129,32 +130,52 @@ class WhyNot:
 class WhyNotSteps:
     """Explanation why a sequence does not match: for each step, the parts that match in a scene graph.
 
-    Durations and order are ignored.
-
     Attributes
     ----------
     texts : tuple of str
         Text of each step.
     steps : tuple of WhyNot
-        Explanation of each step, with its own bindings.
+        Explanation of each step, with its own bindings. Durations and order are ignored.
+    trace : str
+        Trace whose frames were all tested; empty for a single graph.
+    frames : tuple of int
+        Number of frames of the trace in which each step holds, without its duration; empty for a single graph.
+    apart : tuple of (int, str)
+        Steps that hold in the trace, but never follow the step before as required: the number of the step,
+        from 1, and the link to the step before, such as ``THEN WITHIN 1s``.
     """
 
     texts: tuple[str, ...]
     steps: tuple[WhyNot, ...]
+    trace: str = ""
+    frames: tuple[int, ...] = ()
+    apart: tuple[tuple[int, str], ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """Return the explanation of all steps as a dictionary of texts and numbers."""
         pairs = zip(self.texts, self.steps, strict=True)
-        return {"steps": [{"step": text, **step.as_dict()} for text, step in pairs]}
+        steps = [{"step": text, **step.as_dict()} for text, step in pairs]
+        if not self.trace:
+            return {"steps": steps}
+        counted = [{**step, "frames": n} for step, n in zip(steps, self.frames, strict=True)]
+        apart = [{"step": number, "link": link} for number, link in self.apart]
+        return {"steps": counted, "trace": self.trace, "apart": apart}
 
     def __str__(self) -> str:
         lines: list[str] = []
         for number, (text, step) in enumerate(zip(self.texts, self.steps, strict=True), start=1):
             lines += [f"step {number} of {len(self.steps)}: {text}"]
             lines += [f"  {line}" for line in str(step).splitlines()]
-        return "\n".join(
-            [*lines, "parts that need other frames (FOR, THEN, EVENTUALLY …) are not tested"]
-        )
+        if not self.trace:
+            lines.append("parts that need other frames (FOR, THEN, EVENTUALLY …) are not tested")
+        for number, count in enumerate(self.frames, start=1):
+            where = f"in {number_of(count, 'frame')} of" if count else "in no frame of"
+            lines.append(f"step {number} holds {where} {self.trace}")
+        lines += [
+            f"step {number} never follows step {number - 1} in {self.trace}: {link}"
+            for number, link in self.apart
+        ]
+        return "\n".join(lines)
 
 
 def why_not(query: b.Query, view: FrameView, text: str = "") -> WhyNot | WhyNotSteps:
