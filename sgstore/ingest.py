@@ -325,6 +325,14 @@ def _one_by_one(job: Job, paths: list[Path], folder: Path, meter: _Meter) -> Ite
         yield reading.read(path, folder / str(number))
 
 
+def _other_ego(file: StoreFile, outcome: TraceOutcome, sealed: Sealed) -> str:
+    """Return the ego of the trace whose name was taken, if it is from the same recording."""
+    if not (taken := outcome.taken_name):
+        return ""
+    trace = file.trace(taken)
+    return trace.ego if trace.digest == sealed.identity.digest else ""
+
+
 def _published(
     job: Job, file: StoreFile | None, views: Views
 ) -> tuple[StoreFile | None, list[TraceOutcome]]:
@@ -355,10 +363,7 @@ def _published(
         outcome = outcomes[number]
         if isinstance(name, str):
             outcome.name, outcome.status = name, "added" if known[number] is None else "replaced"
-            if file and (taken := outcome.taken_name):
-                trace = file.trace(taken)
-                same = trace.digest == ready[number].identity.digest
-                outcome.other = trace.ego if same else ""
+            outcome.other = _other_ego(file, outcome, ready[number]) if file else ""
         elif isinstance(name, PresentError):  # the same recording twice in one run
             same = (outcome.path, "present", name.name, outcome.ego, outcome.frames)
             outcomes[number] = TraceOutcome(*same, seconds=outcome.seconds)

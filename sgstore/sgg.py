@@ -736,8 +736,8 @@ class SceneGraphGenerator:
             self._left_out = np.append(self._left_out, np.array(left_out, np.bool_))
             self._parking.learn(entities)
             self._hitches.learn(entities)
-            if self._survey is not None:
-                self._survey.learn(entities, frames.scenery)
+        if self._survey is not None:
+            self._survey.learn(frames)
         if len(frames.scenery):
             self._scenery = chained([self._scenery, frames.scenery])
             if self._still.wanted:

@@ -192,11 +192,24 @@ def test_a_light_of_the_trace_takes_the_place_of_that_of_the_map() -> None:
     light = thing("light", 30, 5, kind="traffic_light", map_ref="s1")
     post = thing("post", 30, 5, kind="pole", map_ref="o1", static=True)
 
-    graph = graph_of(frames([thing("ego"), light, post], [thing("ego"), post]), STREET)
+    scenes = [thing("ego")], [thing("ego"), light, post], [thing("ego"), post]
+    graph = graph_of(frames(*scenes), STREET)
 
-    assert {"s1", "s2", "o1"} & names_present(graph, 0) == {"s2"}
-    assert {"s1", "s2", "o1"} & names_present(graph, 1) == {"s1", "s2"}
-    assert ("light", "controlsTrafficOf", "east on") in edges(graph, 0, STREET)
+    shown = [{"s1", "s2", "o1"} & names_present(graph, frame) for frame in range(3)]
+    assert shown == [{"s1", "s2"}, {"s2"}, {"s2"}]  # also after its last state
+    assert ("light", "controlsTrafficOf", "east on") in edges(graph, 1, STREET)
+
+
+def test_a_light_of_the_trace_that_is_out_of_range_is_not_that_of_the_map() -> None:
+    """The signal of the map is in range; the light of the trace is out of range in the first frame."""
+    narrow = Config(range=RangeSettings(46.5))
+    light = thing("light", 50, 5, kind="traffic_light", map_ref="s1")
+    graph = graph_of(frames([thing("ego"), light], [thing("ego", 10), light]), STREET, narrow)
+    alone = graph_of(frames([thing("ego")], [thing("ego", 10)]), STREET, narrow)
+
+    named = [names_present(of, frame) & {"s1"} for of in (graph, alone) for frame in (0, 1)]
+    assert named == [set(), set(), {"s1"}, {"s1"}]
+    assert [nodes(graph, frame) for frame in (0, 1)] == [["ego"], ["ego", "light"]]
 
 
 def test_of_an_object_that_is_repeated_the_one_at_its_place_is_replaced() -> None:

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
     from sgstore.graphs.relations._extent import Areas
     from sgstore.graphs.relations._waypoints import Waypoints
-    from sgstore.model.world import Bools, Entities, Floats, Ints, States
+    from sgstore.model.world import Bools, Floats, FrameBlock, Ints
 
     Rows = NDArray[np.intp]
     LookUp = Callable[[Floats, Floats], LaneHits]
@@ -111,15 +111,21 @@ class LaneContact:
             key = bool(IS_SIGNAL[nodes.kind[column]]), ref
             self._columns.setdefault(key, []).append(column)
         none = np.zeros(0, np.int64)
-        self._twins: tuple[Ints, Ints] = (none, none)
+        self._twins: tuple[Ints, Ints] = (none, none)  # column, and first frame in this block
         self._controls: tuple[Ints, Ints] = (none, none)
         self._affects: tuple[Ints, Ints] = (none, none)
 
-    def learn(self, entities: Entities, scenery: States) -> None:
-        """Record new objects, and the poses of static objects, in order of node id."""
+    def learn(self, frames: FrameBlock) -> None:
+        """Record the new objects of the next block of frames, and the poses of static objects."""
+        self._twins = self._twins[0], np.zeros_like(self._twins[1])
+        entities, scenery = frames.entities, frames.scenery
+        if not len(entities):
+            return
         places = dict(
             zip(scenery.node.tolist(), zip(scenery.x, scenery.y, strict=True), strict=True)
         )
+        nodes, rows = np.unique(frames.states.node, return_index=True)
+        since = dict(zip(nodes.tolist(), frames.frame_of[rows].tolist(), strict=True))
         twins: list[tuple[int, int]] = []
         controls: list[tuple[int, int]] = []
         affects: list[tuple[int, int]] = []
@@ -130,7 +136,7 @@ class LaneContact:
             place = places.get(node, (np.nan, np.nan))
             column = self._column((is_signal, ref), place)
             if column is not None:
-                twins.append((node, column))
+                twins.append((column, since.get(node, 0)))
             if is_signal and entities.subkind[row] not in NOT_FOR_MOTOR_TRAFFIC:
                 controls += [(node, lane) for lane in self._map.lanes_of_signal(ref).tolist()]
                 affects += [(node, lane) for lane in self._reach.of(ref, place).tolist()]
@@ -203,12 +209,14 @@ class LaneContact:
 
         A lane or crosswalk under a body is present even if it begins just out of range; so are its
         road and junction. ``off_road`` is present if a body is in it. A signal or object of the map
-        is absent if an entity of the trace represents it.
+        is absent from the first frame on in which an entity of the trace represents it, also if that
+        entity is out of range.
         """
         present: Bools = areas.parts(self._map)
         present[:, -1 - OFF_ROAD] = False
-        doubled, index = joined(self._twins[0], bodies.node)
-        present[bodies.frame[doubled], self._twins[1][index]] = False
+        columns, since = self._twins
+        frame, index = np.nonzero(np.arange(len(present))[:, None] >= since)
+        present[frame, columns[index]] = False
         hits, (at, parts), off_road = standing.hits, standing.parts, standing.off_road
         rows = np.concatenate([hits.row, at, off_road])
         nodes = np.concatenate([hits.lane, parts, np.full(len(off_road), OFF_ROAD)])
