@@ -536,6 +536,8 @@ class SandboxPool:
     def _more(self, many: int) -> None:
         with suppress(SgstoreError):  # the first one started, so this fault is temporary
             for _ in range(many):
+                if self._closed:
+                    return
                 self._ready(self._make())
 
     def _again(self, box: Sandbox) -> None:
@@ -546,7 +548,7 @@ class SandboxPool:
     def _ready(self, box: Sandbox) -> None:
         """Warm up a new sandbox process with a first query, then add the process to the pool."""
         with suppress(SgstoreError):
-            if self._first is not None:
+            if self._first is not None and not self._closed:
                 box.ask(self._first)
         self._put(box)
 

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from sgstore.apps.sandbox import SandboxPool
+from sgstore.apps import sandbox
+from sgstore.apps.sandbox import Sandbox, SandboxPool
 from sgstore.errors import QueryError, SqlError
 from sgstore.query import Store
 
@@ -124,3 +125,34 @@ def test_two_questions_of_one_key_are_told_apart(pool: SandboxPool) -> None:
     with pytest.raises(QueryError, match="under way"):
         asked(pool, "sql", "SELECT 1", "same")
     found.close()  # type: ignore[attr-defined]
+
+
+def test_a_closed_pool_starts_no_more_processes(
+    town_store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closing, made, asked = threading.Event(), list[Sandbox](), list[object]()
+
+    class Watched(Sandbox):
+        def __init__(self, *args: Any, **how: Any) -> None:
+            made.append(self)
+            if len(made) > 1:  # the first one is there before the others start
+                closing.wait(60)
+            super().__init__(*args, **how)
+
+        def ask(self, question: Any, *how: Any) -> dict[str, Any]:
+            asked.append(question)
+            return super().ask(question, *how)
+
+        def stop(self) -> None:
+            closing.set()  # the pool stops its processes after it counts as closed
+            super().stop()
+
+    monkeypatch.setattr(sandbox, "Sandbox", Watched)
+    pool = SandboxPool(
+        town_store, small=("parts", "values", "why"), first={"find": "MATCH (e:Ego)"}
+    )
+    pool.close()
+
+    assert len(made) <= 3  # the first, and one of each of the two threads
+    assert asked == []
+    assert not any(one.is_ready for one in made)
