@@ -54,6 +54,8 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def served(written: Path) -> Iterator[Callable[[Path], str]]:
     """Serves stores; each address has its token."""
+    from explorer_page import end  # skips without Playwright
+
     children: dict[Path, tuple[subprocess.Popen[str], str]] = {}
 
     def start(store: Path) -> str:
@@ -66,10 +68,7 @@ def served(written: Path) -> Iterator[Callable[[Path], str]]:
         return children[store][1]
 
     yield start
-    for child, _ in children.values():
-        child.terminate()
-    for child, _ in children.values():
-        child.communicate(timeout=120)
+    end(*(child for child, _ in children.values()))
 
 
 SIZE = {"width": 1440, "height": 900}

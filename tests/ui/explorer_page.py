@@ -5,9 +5,12 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import pytest
+
+if TYPE_CHECKING:
+    import subprocess
 
 sync = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
 pytest.importorskip("uvicorn", reason="the extra [ui] is not installed")
@@ -21,6 +24,19 @@ PICTURES = os.environ.get("SGSTORE_SCREENSHOTS")
 
 AXE = Path(__file__).parents[2] / "build" / "page" / "node_modules" / "axe-core" / "axe.min.js"
 """What finds faults of accessibility; ``tools/vendor.py --check`` installs it."""
+
+
+def end(*servers: subprocess.Popen[str]) -> None:
+    """End servers, and wait for their ends. A server that goes on is killed, and fails the test."""
+    try:
+        for server in servers:
+            server.terminate()
+        for server in servers:
+            server.communicate(timeout=120)  # a busy machine
+    finally:
+        for server in servers:
+            server.kill()
+            server.wait()
 
 
 def search(page: Any, query: str) -> None:

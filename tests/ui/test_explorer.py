@@ -18,6 +18,7 @@ import pytest
 from explorer_page import (
     AXE,
     NEAR,
+    end,
     expect,
     expect_to_play,
     faults,
@@ -317,8 +318,7 @@ def test_a_monitor_is_seen_while_it_runs(visit: Callable[..., Any]) -> None:
             assert faults(page) == []
         page.close()  # before what it listens to is gone
     finally:
-        child.terminate()
-        child.communicate(timeout=120)
+        end(child)
 
 
 def test_every_width_and_both_schemes_fit(page: Any) -> None:

@@ -20,7 +20,7 @@ from urllib.parse import quote
 
 import duckdb
 import pytest
-from explorer_page import NEAR, expect, search
+from explorer_page import NEAR, end, expect, search
 
 from sgstore.apps.demo import SMALL
 from sgstore.apps.report import report
@@ -55,8 +55,7 @@ class Served:
 
     def stop(self) -> None:
         assert self.child is not None
-        self.child.terminate()
-        self.child.communicate(timeout=120)  # a busy machine
+        end(self.child)
 
     def link(self, **parts: str) -> str:
         told = "&".join(f"{name}={quote(value)}" for name, value in parts.items())
