@@ -209,7 +209,7 @@ def _lost(path: Path, code: int) -> TraceOutcome:
 # same store as an uninterrupted run.
 
 BLOCK_FRAMES: Final = 4 * BUCKET_FRAMES
-"""Number of frames in a block: whole buckets, so that a mask of 64 frames is one row."""
+"""Number of frames in a block: whole buckets, so that a mask of 60 frames is one row."""
 
 
 def ingest(  # noqa: PLR0913  one option per way to read

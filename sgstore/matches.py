@@ -1308,7 +1308,7 @@ def row_type(columns: tuple[str, ...]) -> Any:
 
 
 class Windows:
-    """Iterator over ranges of buckets (64 frames each), so that a search reads one trace after another.
+    """Iterator over ranges of buckets (60 frames each), so that a search reads one trace after another.
 
     A small store yields only ``None``: all buckets.
 

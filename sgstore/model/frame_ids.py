@@ -1,4 +1,4 @@
-"""Frame ids: trace id, bucket number (64 frames) and frame number in the bucket, in one integer.
+"""Frame ids: trace id, bucket number (60 frames) and frame number in the bucket, in one integer.
 
 Also the text form of a range of frames.
 """
@@ -30,7 +30,7 @@ SEQ_BITS: Final = BUCKET_BITS + FRAME_BITS
 
 
 def trace_bucket(trace_id: int | Ints, seq: Ints) -> Ints:
-    """Return the bucket number (group of 64 frames) of each frame number of a trace."""
+    """Return the bucket number (group of 60 frames) of each frame number of a trace."""
     return (trace_id << BUCKET_BITS) + seq // BUCKET_FRAMES
 
 
@@ -40,7 +40,7 @@ def frame_ids(trace_id: int | Ints, seq: Ints) -> Ints:
 
 
 def frames_of(bucket: Ints, mask: Ints) -> tuple[Ints, Ints]:
-    """Convert bit masks of 64 frames each to frame ids. Also return the row of the mask for each id."""
+    """Convert bit masks of 60 frames each to frame ids. Also return the row of the mask for each id."""
     ids: list[Ints] = []
     rows: list[Ints] = []
     for bit in range(BUCKET_FRAMES):

@@ -285,7 +285,7 @@ class Abstracted:
             return coded_classes(connection, abstraction_named(name).name)
 
     def masks(self, name: str) -> Iterator[tuple[str | None, int, int]]:
-        """Yield (class, bucket, bit mask) for all frames; a bucket has 64 frames. Missing classes are computed.
+        """Yield (class, bucket, bit mask) for all frames; a bucket has 60 frames. Missing classes are computed.
 
         Computed classes are not stored.
         """

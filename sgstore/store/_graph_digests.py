@@ -213,7 +213,7 @@ def _of_rows(hashed: tuple[int, Words], number: NDArray[Any]) -> NDArray[Any]:
 
 
 def _by_frame(place: Ints, mask: Ints, hashes: Words, count: int) -> Words:
-    """Return the sum of row hashes for each frame, (64 B,). B counts the buckets of 64 frames."""
+    """Return the sum of row hashes for each frame id, (64 B,). B counts the buckets (60 frames, 64 ids)."""
     sums = np.zeros(count << FRAME_BITS, np.uint64)
     first, behind = place << FRAME_BITS, mask << 1
     _add_at_bits(sums, first, mask & ~behind, hashes)

@@ -307,7 +307,7 @@ def _remembered(maps: OrderedDict[str, T], digest: str, read: Callable[[], T]) -
 def _asked(
     frame_id: NDArray[np.int64], otherwise: int = 0
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the SQL parameters of a frame selection in two forms: frame ids, and bit masks of 64 frames.
+    """Return the SQL parameters of a frame selection in two forms: frame ids, and bit masks of 60 frames.
 
     ``otherwise``: bounds without any frame.
     """

@@ -268,7 +268,7 @@ _ROWS_TOGETHER: Final = 500_000
 
 
 def _cuts(traces: Mapping[int, StoredTrace], published: _Published, table: str) -> Iterator[int]:
-    """Yield bucket numbers that divide a table into ranges that fit into memory. A bucket has 64 frames."""
+    """Yield bucket numbers that divide a table into ranges that fit into memory. A bucket has 60 frames."""
     together = 0
     for trace_id, trace in sorted(traces.items()):
         rows = published.get(("trace", trace_id), {}).get(table, Checksum()).rows

@@ -508,7 +508,7 @@ def frame_times(file: StoreFile, window: Window | None) -> dict[str, Ints]:
 
 
 def buckets_of(file: StoreFile, window: Window | None) -> dict[str, Ints]:
-    """Return the buckets (64 frames each) of a window. A bit mask marks the existing frames of each.
+    """Return the buckets (60 frames each) of a window. A bit mask marks the existing frames of each.
 
     One mask has all frames, one has the frames without a gap before them.
     """

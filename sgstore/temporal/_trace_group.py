@@ -331,7 +331,7 @@ class TraceGroup:
         return places_of(frame_ids, self.frame_ids, self.ids, self.starts)
 
     def table(self, buckets: Ints, keys: Keys, masks: Ints) -> TimedRelation:
-        """Return a table of matches from rows in any order: bucket (64 frames), node ids, frame mask."""
+        """Return a table of matches from rows in any order: bucket (60 frames), node ids, frame mask."""
         traces = buckets >> BUCKET_BITS
         owners = np.searchsorted(self.ids, traces)
         if len(self.ids):

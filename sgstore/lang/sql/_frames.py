@@ -287,7 +287,7 @@ def _by_buckets(
     edges: frozenset[str],
     wanted: list[Leaf],
 ) -> str:
-    """Return SQL that counts frames: one row per match and bucket (64 frames), with the count."""
+    """Return SQL that counts frames: one row per match and bucket (60 frames), with the count."""
     select, texts = _of_buckets(sql, scope, parts, given, nodes, edges, wanted)
     texts[INVARIANT] = held(PATTERN)
     columns = {column: f"{PATTERN}.{column}" for column in columns_of(nodes, edges)}
@@ -354,7 +354,7 @@ def in_masks(
 
 
 def _lasting(sql: SqlBuilder, scope: Scope, wanted: Iterable[Leaf]) -> str | None:
-    """Return SQL with one row per match and bucket (64 frames); None if a value can change in a bucket."""
+    """Return SQL with one row per match and bucket (60 frames); None if a value can change in a bucket."""
     parts, wanted = phases(sql, scope), list(dict.fromkeys(wanted))
     known = sql.found_in(scope)
     if (known and not known.runs) or parts.rest or parts.late:

@@ -92,7 +92,7 @@ def frames_with(rows: str, keys: list[str], wanted: CountRange) -> str:
 
 
 def _summed(rows: str, keys: list[str], wanted: CountRange) -> str:
-    """Return SQL that counts rows per frame with sums of masks, for buckets (64 frames) with few rows."""
+    """Return SQL that counts rows per frame with sums of masks, for buckets (60 frames) with few rows."""
     sums = [
         f'CAST(sum(("mask" >> {shift}) & {_ONES}) AS BIGINT) AS {_sum(shift)}'
         for shift in range(WIDTH)
@@ -126,7 +126,7 @@ def _reached(bound: int) -> str:
 
 
 def _one_by_one(rows: str, keys: list[str], wanted: CountRange) -> str:
-    """Return SQL that counts rows frame by frame, for buckets (64 frames) with many rows."""
+    """Return SQL that counts rows frame by frame, for buckets (60 frames) with many rows."""
     group = ['"bucket"', *keys]
     crowded = Select(group, [quoted(rows)], group=group)
     if wanted.least <= MOST:

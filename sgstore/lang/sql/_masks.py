@@ -1,4 +1,4 @@
-"""SQL of the first phase: candidate frames as bit masks. A mask has one bit for each of 64 frames (a bucket).
+"""SQL of the first phase: candidate frames as bit masks. A mask has one bit for each of 60 frames (a bucket).
 
 The mask of a row of ``edge`` or ``node`` marks the frames of a bucket in which the row holds. So edges join
 on bucket and node ids, and the frames of a match are the common bits of all masks. Conditions on attributes
@@ -60,7 +60,7 @@ def bit_of(frame: str) -> str:
 
 
 def folded(text: str, keys: list[str]) -> str:
-    """Return SQL that converts rows of single frames to bit masks: one row per bucket (64 frames)."""
+    """Return SQL that converts rows of single frames to bit masks: one row per bucket (60 frames)."""
     bit = bit_of('"frame_id"')
     select = Select(['"frame_id" >> 6 AS "bucket"', *keys, f'bit_or({bit}) AS "mask"'])
     select.join(nested(text, ":frames"), [])
@@ -69,7 +69,7 @@ def folded(text: str, keys: list[str]) -> str:
 
 
 def merged(text: str, values: Mapping[str, str]) -> str:
-    """Return SQL that merges the bit masks of rows with equal bucket (64 frames) and equal values.
+    """Return SQL that merges the bit masks of rows with equal bucket (60 frames) and equal values.
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ class Base:
     def join(
         self, table: str, alias: str, ends: Mapping[str, str], conditions: Iterable[str] = ()
     ) -> None:
-        """Join a table of bit masks on the bucket (64 frames), and on the nodes that are joined already.
+        """Join a table of bit masks on the bucket (60 frames), and on the nodes that are joined already.
 
         ``ends`` are its node columns.
         """
@@ -168,7 +168,7 @@ class Base:
         self.select.join(table, on)
 
     def need_bucket(self) -> None:
-        """Join the table ``bucket`` (map of each 64 frames), unless it is part of the join already."""
+        """Join the table ``bucket`` (map of each 60 frames), unless it is part of the join already."""
         if not self.knows_map:
             self.knows_map = True
             on = [f'{BUCKET}."bucket" = {self.bucket}'] if self.bucket else []
@@ -222,9 +222,9 @@ class SqlBuilder:
         return self.found if scope is self.query.scope else None
 
     def within(self, column: str, per: int = 1, *, met: bool = False) -> list[str]:
-        """Return SQL conditions that keep only frames (or buckets of 64 frames) in the time window.
+        """Return SQL conditions that keep only frames (or buckets of 60 frames) in the time window.
 
-        It holds buckets of 64 frames, or frames if ``per`` is 64.
+        It holds buckets of 60 frames, or frames if ``per`` is 64.
 
         ``met``: the rows are joined with rows of the selected traces. Then the range is sufficient, unless
         matches are known.
@@ -295,7 +295,7 @@ def number_of_frames(text: str) -> str:
 def found_masks(found: SharedRelation) -> str:
     """Return SQL that converts series of frames (first, last) to bit masks.
 
-    Each run is within a bucket of 64 frames.
+    Each run is within a bucket of 60 frames.
     """
     mask = (
         '((1::BIGINT << ("last" - "first" + 1)::INTEGER) - 1) << ("first" & 63)::INTEGER AS "mask"'
@@ -305,7 +305,7 @@ def found_masks(found: SharedRelation) -> str:
 
 
 def in_which(alias: str) -> list[str]:
-    """Return the SQL columns with the frames of a row: bucket (64 frames) and bit mask."""
+    """Return the SQL columns with the frames of a row: bucket (60 frames) and bit mask."""
     return [f'{alias}."bucket"', f'{alias}."mask"']
 
 
@@ -356,7 +356,7 @@ def base_rows(
     edges: frozenset[str],
     kinds: frozenset[str] = frozenset(),
 ) -> str:
-    """Return SQL that joins nodes and edges of a pattern: one row per match and bucket (64 frames)."""
+    """Return SQL that joins nodes and edges of a pattern: one row per match and bucket (60 frames)."""
     unfolded = _unfolded(sql, scope, parts, given, nodes, edges)
     if unfolded:
         return unfolded

@@ -653,7 +653,7 @@ INVARIANT: Final = FrameAttribute(
 
 
 def is_lasting(leaf: Leaf, scope: Scope, catalog: Catalog) -> bool:
-    """True if a value of a match cannot change within a bucket of 64 frames."""
+    """True if a value of a match cannot change within a bucket of 60 frames."""
     match leaf:
         case NodeValue() | EdgeRelation() | TraceAttribute():
             return True

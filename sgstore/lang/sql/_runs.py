@@ -14,7 +14,7 @@ from sgstore.lang.sql._select import Select, nested
 from sgstore.lang.sql._windows import TRACE_OF_BUCKET
 
 _LAST: Final = 59
-"""SQL of the bit for the last frame of a bucket (64 frames)."""
+"""SQL of the bit for the last frame of a bucket (60 frames)."""
 
 
 def runs(masks: str, keys: list[str], apart: list[str]) -> str:

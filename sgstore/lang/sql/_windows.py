@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Range of buckets (64 frames each), from ``low`` to just before ``high``.
+    """Range of buckets (60 frames each), from ``low`` to just before ``high``.
 
     ``traces`` limits it to some traces.
     """
@@ -32,7 +32,7 @@ class Window:
 
     @classmethod
     def of(cls, extents: Sequence[tuple[int, int]]) -> Window:
-        """Return the smallest window that contains the given ranges of buckets (64 frames each).
+        """Return the smallest window that contains the given ranges of buckets (60 frames each).
 
         The ranges are whole traces, or a part of one trace.
         """
@@ -60,7 +60,7 @@ TRACE_OF_FRAME: Final = 24
 
 
 def extents(catalog: Catalog) -> list[tuple[int, int]]:
-    """Return, for each trace in order, the number of its first bucket (64 frames) and its bucket count."""
+    """Return, for each trace in order, the number of its first bucket (60 frames) and its bucket count."""
     return [trace.extent for trace in catalog.traces]
 
 
