@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class CheckInCatalog:
-    """``CHECK`` statement with resolved names, and the catalog (list of known names) that resolved them."""
+    """``CHECK`` statement with resolved names, and the catalog (known names of a store) used for this."""
 
     check: b.BoundCheck
     catalog: Catalog

@@ -151,7 +151,7 @@ def _attribute(e: s.AttributeOf, names: SymbolTable) -> b.Bound:
 
 
 def _hint_elsewhere(name: str, known: Sequence[str]) -> str | None:
-    """If an unknown attribute name is known elsewhere, return a hint; otherwise None."""
+    """If nodes or the query language have the unknown attribute name, return a hint; otherwise None."""
     if (hint_at(name, known) or "").startswith("did"):
         return None
     if normalize_name(name) in NODE_ATTRIBUTES:

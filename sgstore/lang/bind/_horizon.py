@@ -123,7 +123,7 @@ def horizon(check: BoundCheck, speed: float = FASTEST) -> Horizon:
 
 
 def spoken_kinds(check: BoundCheck) -> tuple[frozenset[str], frozenset[str]]:
-    """Return two sets of node kinds. Without these nodes, a check can be wrongly true, or wrongly false.
+    """Return two sets of node kinds. If these nodes are missing, a check can be wrongly true, or wrongly false.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ class _Missed:
 
     @property
     def either(self) -> _Missed:
-        """Return a copy for which the missing node can cause both wrong verdicts."""
+        """Return a copy in which the missing node can cause both wrong verdicts: true and false."""
         return replace(self, true=True, false=True)
 
 
@@ -256,7 +256,7 @@ class _Looking:
         return found
 
     def _is_joined(self, scope: Scope, key: str) -> bool:
-        """True if edges connect a node of a pattern to a node whose distance from the ego is limited."""
+        """True if a node of a pattern is connected by edges to a node at a limited distance from the ego."""
         reached, grown = {key}, True
         while grown:
             fresh = {
@@ -338,7 +338,7 @@ class _Looking:
 
 
 def _goes_on(formula: Bound, *, wanted: bool) -> bool:
-    """True if a formula can have the wanted value (true or false) only before the last frame."""
+    """True if a formula can have the given value (true or false) only before the last frame."""
     match formula:
         case b.Tense(word="NEXT" | "WEAKNEXT"):
             return wanted == (formula.word == "NEXT")
@@ -353,7 +353,7 @@ def _goes_on(formula: Bound, *, wanted: bool) -> bool:
 
 
 def _may_be_empty(tense: b.Tense, *, wanted: bool) -> bool:
-    """True if a temporal operator has the wanted value in case no frame lies in its time window.
+    """True if a temporal operator has the given value when its time window has no frames.
 
     Examples: ``NEXT`` in the last frame is false, ``HISTORICALLY[1s, 2s]`` in the first frame is true.
     """

@@ -78,7 +78,7 @@ def homes_of(attribute: Attribute, profile: Profile) -> set[Home]:
 
 
 def kind_conditions(kinds: Kinds, kind: str, ego: str | None, held: frozenset[str]) -> list[str]:
-    """Return SQL conditions that select rows by the kind of a node, and by its being the ego or not.
+    """Return SQL conditions that select rows by the kind of a node, and by whether it is the ego.
 
     ``ego=None`` means that no row is the ego.
 
@@ -146,14 +146,14 @@ def edge_conditions(
 
 
 def alias_of(edge: Edge) -> str:
-    """Return the SQL alias of a pattern edge: its key, and its relation if it can have only one."""
+    """Return the SQL alias of a pattern edge: the edge's key, and its relation if only one is possible."""
     return (
         f"{edge.key}:{next(iter(edge.relations))}" if len(edge.relations) == 1 else f"{edge.key}:"
     )
 
 
 def entities_of_pairs(scope: Scope, _: Catalog) -> Scope:
-    """Return a pattern whose nodes must be entities if a condition compares a number of two of them.
+    """Return a pattern in which each node must be an entity if a condition such as ``ttc(a, b) < 2`` uses it.
 
     An example is ``ttc(a, b) < 2``.
 
@@ -171,7 +171,7 @@ def entities_of_pairs(scope: Scope, _: Catalog) -> Scope:
 
 
 def on_lanes() -> frozenset[str]:
-    """Return the kinds of nodes that have places on lanes: entities, and parts of the map."""
+    """Return the kinds of nodes that can be located on lanes: entities, and parts of the map."""
     return entity_kinds() | _ON_LANES
 
 

@@ -68,7 +68,7 @@ def bind_block(block: s.Block, names: SymbolTable) -> None:
 
 
 def _asks_for_a_node(block: s.Block) -> bool:
-    """True for ``(:Ego)`` alone, whose existence is known in every frame."""
+    """True if a pattern is a single node without conditions, such as ``(:Ego)``."""
     (node, *others) = [node for path in block.paths for node in path.nodes]
     return not (others or node.properties or node.where or block.where)
 
@@ -102,7 +102,7 @@ ALL_BINDERS: Final[Binders] = {
 
 
 def _node(node: s.NodePattern, names: SymbolTable, *, the_ego: bool = False) -> str:
-    """Return the key of a pattern node. If ``the_ego``, a new node with the label ``Ego`` is ``ego``."""
+    """Return the key of a pattern node. If ``the_ego``, a node with the label ``Ego`` has the key ``ego``."""
     kinds = kinds_of(node.label, names.session) if node.label else b.any_kinds()
     if not kinds:
         names.session.refuse("no node can have this label", node.span)

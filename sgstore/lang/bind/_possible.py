@@ -103,7 +103,7 @@ def check_edges(written: Sequence[Written], names: SymbolTable) -> None:
 
 
 def _sort(kinds: b.Kinds) -> b.Kinds:
-    """If some kinds include an entity kind, return them with all entity kinds added."""
+    """If some kinds include an entity kind, return these kinds together with all entity kinds."""
     return kinds | _WORDS["entity"] if kinds.other & _OWN else kinds
 
 
@@ -282,7 +282,7 @@ def _range(low: float, high: float, constant: b.Value) -> str:
 
 
 def _wrong_words(left: b.Bound, word: str, texts: set[str], names: SymbolTable) -> tuple[str, str]:
-    """If a compared kind or relation cannot occur, return ``never`` or ``always``, and a hint."""
+    """If a compared kind or relation cannot occur, return ``always`` or ``never`` (the result), and a hint."""
     possible, hint = None, ""
     if isinstance(left, b.NodeAttribute) and left.attribute.name == "kind":
         possible = (names.session.kinds_left.get(left.node) or names.scope.kinds(left.node)).every

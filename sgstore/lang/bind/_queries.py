@@ -338,7 +338,7 @@ _CHOICES: Final = {
 
 
 def _choose(found: UsingChoice, setting: s.Setting, value: str, session: Session) -> None:
-    """Store a ``USING`` setting whose value is one of a few fixed words, such as ``NODES any``."""
+    """Store a ``USING`` setting. Its value is one of a few fixed words, as in ``NODES any``."""
     name, word = normalize_name(setting.name), value.lower()
     if word not in _CHOICES[name]:
         session.unknown(f"value of {setting.name}", value, setting.span, _CHOICES[name])

@@ -203,7 +203,7 @@ class _WrittenGroup:
 
     @property
     def rounds(self) -> list[list[_WrittenSteps]]:
-        """Alternatives of the group: one list per repetition if each has its own steps, else one list."""
+        """Alternatives of the group: a list for each repetition if repetitions have own steps, or one list."""
         size = len(self.alternatives) // (self.group.high if self.fresh else 1)
         every = self.alternatives
         return [every[first : first + size] for first in range(0, len(every), size)]
@@ -305,7 +305,7 @@ def _bind_steps(
     *,
     again: bool = False,
 ) -> None:
-    """Resolve the steps of a sequence in reading order. ``again``: a group repeats these steps."""
+    """Resolve the steps of a sequence in reading order. ``again``: True if a group repeats these steps."""
     for one in written.steps:
         if isinstance(one, _Written):
             if again and one.step.name is not None:

@@ -80,7 +80,7 @@ class _Match:
 
 
 def _may_be_same(one: b.Kinds, other: b.Kinds) -> bool:
-    """True if two variables can match the same node. If both must be the ego, the result is False."""
+    """True if two variables can match the same node; False if both must be the ego."""
     return bool(one.other & other.other or (one.ego & other.ego and (one.other or other.other)))
 
 
@@ -275,7 +275,7 @@ class StageBinder:
     def _named(
         self, item: s.Item, names: SymbolTable, written: list[s.Item]
     ) -> Mapping[str, Symbol]:
-        """Return the name that a ``WITH`` item passes on, and its meaning. Add other items to ``written``."""
+        """Return the name and meaning of a ``WITH`` item. Append it to ``written``, unless it is a node."""
         value = item.value
         if isinstance(value, s.Variable):
             symbol = names.meaning(value.name)
@@ -355,7 +355,7 @@ MOST_WAYS: Final = 100
 
 
 def _place(name: str, value: b.Bound | None, session: Session) -> b.FrameAttribute:
-    """Return a placeholder for a value that ``WITH`` passes on, or for a path if the value is missing."""
+    """Return a placeholder for a value that ``WITH`` passes on. Without a value, it is for a path."""
     session.numbers += 1
     if value is None or b.is_path(value):
         return b.passed_on(f"{b.PASSED}{name} p{session.numbers}", Type.list)

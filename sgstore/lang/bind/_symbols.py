@@ -184,7 +184,7 @@ class Session:
         raise QueryError(reason, text=self.text, span=span, hint=hint)
 
     def impossible(self, reason: str, span: TextSpan, hint: str) -> None:
-        """Raise an error for a part that no recording can match. In a predicate, only add a note."""
+        """Raise an error for a part that no recording can match. Inside a predicate, add a note instead."""
         if self.strict and not self.calls and not self.shipped:
             self.refuse(reason, span, hint)
         self.doubt(f"{reason}; {hint}")
@@ -254,7 +254,7 @@ class ScopeBuilder:
         return self.add(THE_EGO, ego_kinds(), span, named=False)
 
     def finished(self) -> Scope:
-        """Return the finished pattern, which has the pairs of its nodes that must differ."""
+        """Return the finished pattern, with the pairs of its nodes that must differ."""
         where = tuple(self.where)
         return Scope(self.nodes, self.outer, tuple(self.edges), where, self.distinct())
 
@@ -307,11 +307,11 @@ class SymbolTable:
     aliases: Mapping[str, Bound] = field(default_factory=dict[str, "Bound"])
 
     def block(self) -> SymbolTable:
-        """Return the symbol table of a pattern in braces inside this part."""
+        """Return a symbol table (known names) for a pattern in braces inside this part."""
         return SymbolTable(self.session, ScopeBuilder(self.session, self.scope), parent=self)
 
     def body(self, meanings: dict[str, Symbol]) -> SymbolTable:
-        """Return the symbol table for the body of a predicate that this part of the query calls.
+        """Return a symbol table (known names) for the body of a predicate that this part of the query calls.
 
         The body sees only the given names.
         """
@@ -419,7 +419,7 @@ class SymbolTable:
 
 
 def of_type(value: Bound, kind: Type) -> Bound:
-    """If a value of a topic has an unknown type, return it with the given type; otherwise unchanged."""
+    """Return an expression. If it is a topic value of unknown type, give it the given type."""
     if value.type is not Type.open or kind in {Type.open, Type.null}:
         return value
     if isinstance(value, FrameAttribute):

@@ -82,7 +82,7 @@ def unknown(value: b.Bound) -> b.Bound | None:
 
 
 def has_pairs(value: b.Bound) -> bool:
-    """True if an expression uses a number of two entities, such as ``ttc(a, b)``, which may not exist."""
+    """True if an expression uses a number of two entities that may not exist, such as ``ttc(a, b)``."""
     match value:
         case b.PairNumber():
             return True
@@ -144,7 +144,7 @@ def spelled_out(operands: tuple[b.Bound, ...]) -> b.Bound:
 def certain(  # noqa: PLR0911 - a case each
     condition: b.Bound, *, decided: bool = False
 ) -> b.Bound:
-    """Return a condition that is true if the given one is true whatever the unknown values are.
+    """Return a condition that is true if the given one is true for all values of the unknowns.
 
     A comparison without a value is false. If it compares pair numbers, its negation is false too.
 
@@ -179,7 +179,7 @@ def certain(  # noqa: PLR0911 - a case each
 
 
 def possible(condition: b.Bound) -> b.Bound:
-    """Return a condition that is true if the given one is true for some possible unknown values."""
+    """Return a condition that is true if the given one is true for at least one value of the unknowns."""
     match condition:
         case b.Operation("AND" | "OR", operands):
             return replace(condition, operands=tuple(map(possible, operands)))
@@ -472,7 +472,7 @@ def _total(blocks: Iterable[b.BlockValue]) -> b.Bound:
 
 
 def _all_of(block: b.BlockValue) -> Iterable[b.BlockValue]:
-    """Yield patterns in braces whose matches together are all possible matches of the given pattern."""
+    """Yield patterns in braces that together have all possible matches of the given pattern."""
     where = tuple(possible(pushed(part)) for part in block.scope.where)
     scope = replace(block.scope, where=where)
     yield replace(block, scope=scope, number=block.number + 8 * _LOOSE)

@@ -130,7 +130,7 @@ def looks_less(check: b.BoundCheck, ego: b.Node) -> b.BoundCheck:
 
 
 def _limited(value: b.Bound, ego: b.Node, limit: float) -> b.Bound:
-    """Return an expression whose patterns in braces match only entities near the ego, within a distance."""
+    """Return an expression. Its patterns in braces match only entities within a distance of the ego."""
     again = partial(_limited, ego=ego, limit=limit)
     if not isinstance(value, b.BlockValue):
         return b.with_operands(value, again)
