@@ -253,7 +253,7 @@ class _Translation:
         return f"COUNT {{({member}) WHERE {self._member(arguments[0], member)}}}"
 
     def _written(self, value: ast.expr, at: ast.expr) -> str:
-        """Translate an SGL formula whose value is a number to the query language."""
+        """Translate an SGL formula for a number to the query language."""
         number = value.value if isinstance(value, ast.Constant) else None
         if isinstance(number, bool) or not isinstance(number, int | float):
             raise self._refused("expected a number", at)
@@ -264,7 +264,7 @@ class _Translation:
     # Sets of nodes
 
     def _set(self, value: ast.expr, node: str = "") -> _Found:
-        """Translate an SGL formula whose value is a set of nodes to a pattern.
+        """Translate an SGL formula for a set of nodes to a pattern.
 
         ``node`` is the variable name for its members.
         """
@@ -392,7 +392,7 @@ class _Translation:
         return f"n{self._numbers}"
 
     def _resolved(self, value: ast.expr) -> ast.expr:
-        """Return the expression that the SGL text assigns to a name. Other expressions stay unchanged."""
+        """Return the expression that the SGL text assigns to a name. Return other expressions as they are."""
         for _ in range(MAX_NAMES):
             if not isinstance(value, ast.Name) or value.id not in self._names:
                 return value
