@@ -50,7 +50,7 @@ Compared = tuple[str, str]
 
 
 def compared_in_query(query: b.Query) -> list[Compared]:
-    """Return each comparison of an attribute with a text in a query once."""
+    """Return all comparisons of an attribute with a text in a query, without duplicates."""
     returned = [column.value for column in query.result.columns]
     found = list(_comparisons(returned, query.scope))
     for scope in () if query.steps else query.patterns:
@@ -64,7 +64,7 @@ def compared_in_query(query: b.Query) -> list[Compared]:
 
 
 def compared_in_check(check: BoundCheck) -> list[Compared]:
-    """Return each comparison of an attribute with a text in a check once."""
+    """Return all comparisons of an attribute with a text in a check, without duplicates."""
     values = [check.formula, *(one.where for one in check.quantifiers if one.where is not None)]
     values += [check.reset] if check.reset is not None else []
     return list(dict.fromkeys(_comparisons([*values, *check.scope.where], check.scope)))
@@ -179,7 +179,7 @@ def absent_part(query: b.Query, exists: Callable[[b.Scope], bool]) -> tuple[str,
 def _first_absent(
     query: b.Query, exists: Callable[[b.Scope], bool], calls: b.Calls
 ) -> Iterator[tuple[b.Node | b.Edge | b.Bound, b.Scope, Writer, list[str]]]:
-    """Yield the first part that no frame has, the pattern up to this part, a writer, and the earlier parts.
+    """Yield the first part that no frame matches, the pattern up to it, a text writer and earlier parts.
 
     The calls of predicates in ``calls`` are one part each.
     """
@@ -210,7 +210,7 @@ def _first_absent(
 def nearest_query(
     query: b.Query, exists: Callable[[b.Scope], bool]
 ) -> tuple[str, list[str], str, str] | None:
-    """Return a query for the frame that is nearest to a match of the first part that no frame has.
+    """Return a query for the frame that comes nearest to the first part that no frame matches.
 
     Parameters
     ----------
@@ -241,7 +241,7 @@ def nearest_query(
 
 
 def _nearest(part: b.Node | b.Edge | b.Bound, scope: b.Scope, writer: Writer) -> tuple[str, str]:
-    """Return the value that a pattern's last part compares, and a query for the nearest frame."""
+    """For the last part of a pattern, return the compared value, and a query for the frame nearest to it."""
     value, limit, others = "", "", replace(scope, where=scope.where[:-1])
     match part:
         case b.Node():

@@ -34,7 +34,7 @@ class DrawnEdge:
 
 @dataclass(frozen=True, slots=True)
 class PatternPart:
-    """Part of a graph pattern. It shares no variable with other parts, except nodes that are fixed.
+    """Part of a graph pattern. It shares no variable with other parts, except nodes with a given id.
 
     Attributes
     ----------
@@ -193,7 +193,7 @@ def _written(condition: b.Bound, writer: Writer) -> str:
 
 
 def _call_of(conditions: Sequence[b.Bound], scope: b.Scope, calls: b.Calls) -> str:
-    """Return the predicate call whose definition has all these conditions and more; else an empty text."""
+    """Return the call of a predicate whose definition has these conditions and more; else an empty text."""
     for call, text in calls.items():
         parts = b.conjuncts(call)
         inside = len(parts) > len(conditions) and all(one in parts for one in conditions)
@@ -242,7 +242,7 @@ def _groups(
 
 
 def _ties(atom: _Atom, pins: Mapping[str, Collection[int]], asked: set[str]) -> set[str]:
-    """Return the variables of a node, edge or condition: nodes that are not fixed, and named edges."""
+    """Return the variables of a node, edge or condition: nodes without a given id, and named edges."""
     ties = {f"node {key}" for key in _nodes(atom) if key not in pins}
     if isinstance(atom, b.Edge):
         return ties | ({f"edge {atom.key}"} if atom.named or atom.key in asked else set())
@@ -252,7 +252,7 @@ def _ties(atom: _Atom, pins: Mapping[str, Collection[int]], asked: set[str]) -> 
 
 
 def _apart(scope: b.Scope, pins: Mapping[str, Collection[int]]) -> Iterator[tuple[str, str]]:
-    """Yield the pairs of nodes that must differ. Neither is fixed, and both can be of the same kind."""
+    """Yield the pairs of nodes that must differ. Both have no given id, and can be of the same kind."""
     for one, other in scope.distinct:
         if one not in pins and other not in pins and (scope.kinds(one) & scope.kinds(other)):
             yield one, other

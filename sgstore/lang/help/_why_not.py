@@ -54,7 +54,7 @@ MOST_LOOKED_AT: Final = 10_000
 
 @dataclass(frozen=True, slots=True)
 class WhyNot:
-    """Explanation why a pattern does not match a scene graph: the parts that match, and the first other part.
+    """Explanation why a pattern does not match a scene graph: matching parts, and the first part that fails.
 
     Attributes
     ----------
@@ -179,7 +179,7 @@ class WhyNotSteps:
 
 
 def why_not(query: b.Query, view: FrameView, text: str = "") -> WhyNot | WhyNotSteps:
-    """Return an explanation why a query does not match a scene graph: the parts that match, and the rest.
+    """Return an explanation why a query does not match a scene graph: which parts match, and which do not.
 
     For a sequence, it explains each step.
     """
@@ -518,7 +518,7 @@ def condition_values(
 
 
 def _nearest_binding(query: b.Query, tests: Sequence[b.Bound], view: FrameView) -> Binding | None:
-    """Return the binding that makes conditions true, or comes nearest. Missing edges are left out."""
+    """Return the binding that meets conditions, or comes nearest to it. Missing edges are ignored."""
     apart = {part for test in tests for part in b.conjuncts(test)}
     scope = query.first
     pinned = replace(scope, where=tuple(one for one in scope.where if one not in apart))
