@@ -188,7 +188,7 @@ _OWN: Final[Mapping[Type, Callable[[Any], Any]]] = {
 
 
 def _lifetime(node: int, attributes: Attributes) -> int | None:
-    """Return which entity with this id a node is: 1 for the first one in the trace, 2 for the second.
+    """If several entities have this id one after another, return the number of this one, from 1.
 
     ``None`` for map parts.
     """

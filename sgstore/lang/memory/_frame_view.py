@@ -226,7 +226,7 @@ class FrameView:
         return self._pairs[key][name]
 
     def _on(self, node: int, *, parts: bool = False) -> Sequence[tuple[int, float, float]]:
-        """Return the parts of lanes that an entity occupies. ``parts``: also those of a map part."""
+        """Return the lane intervals of an entity or signal; if ``parts``, also those of other map parts."""
         reach, kind = self.graph.reach, self.nodes[node]["kind"]
         if node >= 0 or reach is None:
             return self._stretches.get(node, ())

@@ -147,13 +147,13 @@ class ScopeSearch:
                 yield from self._bound(at, number)
 
     def _bound(self, at: Binding, number: int) -> Iterator[None]:
-        """Choose the nodes of the search step with this number, and of later ones. Yield once per match."""
+        """Choose the nodes of the search step with this number, and of later steps. Yield once per match."""
         step = self._steps[number]
         if all(self._linked(at, edge) for edge in step.edges) and _all(step.tests, at):
             yield from self._name(at, number, 0)
 
     def _name(self, at: Binding, number: int, nth: int) -> Iterator[None]:
-        """Choose the edges that a step tests or names, then match the later steps. Yield once per match."""
+        """Choose the edges that a step tests or names, and match the later steps. Yield once for each match."""
         step = self._steps[number]
         if nth == len(step.named):
             yield from self._bind(at, number + 1)
@@ -268,7 +268,7 @@ def _fitting(at: Binding, step: _SearchStep) -> list[int]:
 def _steps(
     view: FrameView, relations: frozenset[str], here: int, *, both: bool, forward: bool = True
 ) -> Iterator[int]:
-    """Yield once each neighbour of a node along edges with the given relations."""
+    """Yield each neighbour of a node along edges with the given relations, without duplicates."""
     sides = (view.ahead, view.back) if both else (view.ahead,) if forward else (view.back,)
     found: dict[int, None] = {}
     for side in sides:
