@@ -112,7 +112,7 @@ class Compiled:
     def _told(
         self, query: Query, window: Window | None
     ) -> tuple[Query, SqlBuilder | None, results.Span | None]:
-        """Return three parts for the SQL: the query, a builder of computed matches, and the span columns.
+        """Return the query with added result columns, an SQL builder of its matches, and two columns for spans.
 
         Builder and span can be None.
         """
@@ -161,7 +161,7 @@ class Compiled:
         return self.rows(window, results.with_bindings(self.query))
 
     def clips(self, before_ns: int, after_ns: int, window: Window | None = None) -> SqlStatement:
-        """Return the SQL for clips around matching frames. ``RETURN CLIPS`` has priority over both offsets.
+        """Return the SQL for clips around matching frames. Offsets in ``RETURN CLIPS`` have priority.
 
         Parameters
         ----------

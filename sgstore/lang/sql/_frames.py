@@ -94,7 +94,7 @@ MAP: Final = '":map"'
 
 
 def phases(sql: SqlBuilder, scope: Scope) -> Phases:
-    """Return the conditions of a pattern, grouped by the SQL phase that tests them.
+    """Group the conditions of a pattern by the phase that tests them: on bit masks of frames, or per frame.
 
     Matches that are computed already need no tests.
     """
@@ -110,7 +110,7 @@ def masks(
     edges: frozenset[str] = frozenset(),
     kinds: frozenset[str] = frozenset(),
 ) -> str:
-    """Return SQL of the first phase: a row has the node ids of a match, and its frames as a 64-bit mask.
+    """Return SQL with one row per match: its node ids, and its frames as a 64-bit mask.
 
     ``kinds`` are nodes whose kind is also a column; they must be in :func:`told_kinds`.
     """
@@ -140,7 +140,7 @@ def existence(sql: SqlBuilder, scope: Scope, given: SharedRelation | None) -> st
 def _block(
     sql: SqlBuilder, condition: Bound, given: SharedRelation
 ) -> tuple[str, frozenset[str], bool]:
-    """For a condition with braces, return SQL, nodes from outside the braces, and False if negated."""
+    """For a condition with braces, return its SQL, its nodes from outside the braces, and False if negated."""
     match condition:
         case BlockValue(scope=scope):
             return existence(sql, scope, given), frozenset(scope.outer), True
@@ -180,7 +180,7 @@ def block_matches(
 
 
 def _told_apart(scope: Scope) -> tuple[frozenset[str], frozenset[str]]:
-    """Return the nodes and edges of ``{…}`` that count: two matches differ if one of them differs."""
+    """Return the nodes and edges of ``{…}`` that identify a match: matches differ if one of these differs."""
     nodes = {key for key, node in scope.nodes.items() if node.role != "hidden"}
     edges = frozenset(edge.key for edge in scope.edges if edge.named)
     return frozenset(nodes) | frozenset(scope.outer), edges
@@ -194,7 +194,7 @@ def frames(
     edges: frozenset[str] = frozenset(),
     columns: Iterable[Leaf] = (),
 ) -> str:
-    """Return SQL of the second phase: one row per frame and match.
+    """Return SQL with one row for each match in each single frame.
 
     Parameters
     ----------
@@ -245,7 +245,7 @@ def frames(
 def _needless(
     catalog: Catalog, pairs: Iterable[PairNumber], users: frozenset[str]
 ) -> frozenset[str]:
-    """Return the tests for special pairs, such as a carried entity, that no selected trace needs.
+    """Return the tests for special pairs (such as a carried entity) that the selected traces do not need.
 
     An example is the height on flat roads.
     """
@@ -305,7 +305,7 @@ def _of_buckets(
     edges: frozenset[str],
     wanted: Sequence[Leaf],
 ) -> tuple[Select, dict[Leaf, str]]:
-    """Return SQL of the first phase (frames as bit masks), joined with values of nodes that are constant.
+    """Return SQL of the matches as bit masks of frames, joined with those node values that never change.
 
     The second result is the SQL of each value.
     """
@@ -379,7 +379,7 @@ def _first_phase(
     ties: frozenset[str],
     needed: list[Leaf],
 ) -> tuple[Join, SharedRelation | None]:
-    """Return the first phase, with a row for each frame instead of bit masks; and a shared table."""
+    """Return a join of the matches, with one row per frame instead of bit masks; and a shared subquery."""
     join, nodes = Join(), bound - parts.late
     if parts.empty:
         return join, None
@@ -418,7 +418,7 @@ def _first_phase(
 def _leader(
     sql: SqlBuilder, scope: Scope, parts: Phases, nodes: frozenset[str], needed: list[Leaf]
 ) -> str | None:
-    """Return the node whose states SQL reads first, so that masks need not be expanded; or None.
+    """Return the node at whose states SQL starts, if this is faster than to expand bit masks; else None.
 
     The states are then looked up in the few rows of the first phase, and not these rows among the many
     states. If the query selects traces, it is faster to start from the frames.
@@ -466,7 +466,7 @@ def _of_kinds(sql: SqlBuilder, scope: Scope, key: str, state: str) -> list[str]:
 def _tables_of(
     sql: SqlBuilder, scope: Scope, key: str, needed: list[Leaf], *, stated: bool = False
 ) -> set[Home]:
-    """Return the tables that have the needed attributes of a node. ``stated`` adds the state table."""
+    """Return the tables that have the needed attributes of a node. If ``stated``, include the state table."""
     profile = Profile.of(scope.kinds(key), sql.catalog)
     of_it = [leaf for leaf in needed if key in _valued(leaf)]
     homes = _homes(of_it, profile)
@@ -507,7 +507,7 @@ def _second_phase(
 
 
 def _bind_late(sql: SqlBuilder, join: Join, scope: Scope, key: str) -> None:
-    """Join the states of a node that the first phase (bit masks) does not contain."""
+    """Join the states of a node that the matches (as bit masks of frames) do not contain."""
     alias = quoted(key)
     on = [f'{alias}."frame_id" = {join.frame}'] if join.frame else []
     on += _of_kinds(sql, scope, key, alias)
@@ -716,7 +716,7 @@ _BARE: Final = {DisplayUnit.binding, DisplayUnit.owner, DisplayUnit.role, Displa
 
 
 def _valued(leaf: Leaf) -> frozenset[str]:
-    """Return the nodes whose tables must be joined first to compute a value."""
+    """Return the nodes that a value needs. Their tables must be joined before the value is computed."""
     match leaf:
         case NodeAttribute(node=node, attribute=attribute):
             return frozenset() if attribute.unit in _BARE else frozenset({node})
@@ -750,7 +750,7 @@ def _join_lasting(
     catalog: Catalog,
     needed: Iterable[Leaf],
 ) -> dict[Leaf, str]:
-    """Join tables of constant node values to the first phase (bit masks). Return the SQL of the values.
+    """Join tables of constant node values to the matches (as bit masks of frames). Return the values' SQL.
 
     Results with only such values need no single frames. Their count is the number of frames in a mask.
     """

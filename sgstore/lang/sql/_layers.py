@@ -44,7 +44,7 @@ def pairs_of(found: Iterable[Leaf]) -> list[PairNumber]:
 
 @dataclass(slots=True)
 class Join:
-    """Tables joined for the second phase (values of single frames), under construction.
+    """Joined tables under construction, with one row for each match in each single frame.
 
     Attributes
     ----------
@@ -78,7 +78,7 @@ class Join:
 
 @dataclass(slots=True)
 class Layers:
-    """SELECT statements nested around a join. They compute numbers of entity pairs and test conditions.
+    """SELECT statements nested around a join, which compute numbers of entity pairs and test conditions.
 
     Numbers that no cheap condition needs are computed after the tests of the cheap conditions.
 
@@ -119,7 +119,7 @@ class Layers:
         self.tested = max((stage_of(name, self.without) for name, _, _ in self.early), default=0)
 
     def stage(self, name: str, a: str, b: str) -> int:
-        """Return the nesting level at which SQL computes a number of two entities; 0 if it is stored."""
+        """Return the depth of the nested SELECT that computes a number of two entities; 0 if it is stored."""
         if not stage_of(name):
             return 0
         part = name, a, b
@@ -129,7 +129,7 @@ class Layers:
         return self._stages[part]
 
     def stage_of_test(self, condition: Bound) -> int:
-        """Return the nesting level from which SQL can test a condition."""
+        """Return the depth of the first nested SELECT in which SQL can test a condition."""
         pairs = pairs_of(leaves(condition))
         return max((self.stage(pair.function, pair.a, pair.b) for pair in pairs), default=0)
 
@@ -219,5 +219,5 @@ class Layers:
 
 
 def named(text: str, name: str) -> str:
-    """Return SQL for a named output column. Without need, ``AS`` is omitted."""
+    """Return SQL for a named output column. If the column already has this name, ``AS`` is omitted."""
     return text if text == name or text.endswith(f".{name}") else f"{text} AS {name}"

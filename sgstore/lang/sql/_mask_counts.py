@@ -41,7 +41,7 @@ class CountRange:
 
     @classmethod
     def of(cls, sign: str, number: float) -> CountRange:
-        """Return the range of counts (from 1 up) for which ``count sign number`` is true.
+        """Return the range of counts (from 1 up) for which a comparison such as ``count >= 3`` is true.
 
         The comparison must be false for 0.
         """

@@ -101,7 +101,7 @@ _BRANCHES: Final = 8
 
 @dataclass(slots=True)
 class Base:
-    """Tables joined for the first phase (frames as bit masks), under construction.
+    """Joined tables under construction. Each row has the frames of a match as a bit mask.
 
     Attributes
     ----------
@@ -158,7 +158,7 @@ class Base:
         self.tie(table, ends, [*conditions, *on])
 
     def tie(self, table: str, ends: Mapping[str, str], conditions: Iterable[str]) -> None:
-        """Join a table on the nodes that are joined already. ``ends`` are the table's node columns."""
+        """Join a table on the nodes that it shares with the join. ``ends``: the table's node columns."""
         on = list(conditions)
         for key, column in ends.items():
             if key in self.nodes:
@@ -206,7 +206,7 @@ class SqlBuilder:
 
     @property
     def standing(self) -> frozenset[str]:
-        """Kinds of node whose presence the store has as bit masks: static entities and map parts."""
+        """Kinds of node whose frames the store has as bit masks: static entities and map parts."""
         return self.catalog.fixed | self.catalog.mapped
 
     def edges_of(self, edge: Edge) -> str:
@@ -214,7 +214,7 @@ class SqlBuilder:
         return '"known_edge"' if self.catalog.world and edge.known else '"edge"'
 
     def nodes_of(self, edge: Edge) -> str:
-        """Return the table of static nodes that limits an edge of the map to frames with both nodes."""
+        """Return the table with the frames of static nodes, to find frames with both nodes of a map edge."""
         return '"graph_node"' if self.catalog.world and not edge.known else '"node"'
 
     def found_in(self, scope: Scope) -> SharedRelation | None:
@@ -239,7 +239,7 @@ class SqlBuilder:
         return found
 
     def share(self, text: str, name: str) -> str:
-        """Add a subquery for several parts of the statement, and return its name."""
+        """Add a subquery that several parts of the statement can use, and return its name."""
         full = f"{name} {len(self.shared) + 1}"
         self.shared.append((full, text))
         return full
@@ -418,7 +418,7 @@ def _from_ego(sql: SqlBuilder, scope: Scope, base: Base) -> tuple[tuple[Edge, ..
 def _join_tests(
     sql: SqlBuilder, base: Base, scope: Scope, nodes: set[str], single: dict[str, list[Bound]]
 ) -> None:
-    """Join tables that test the presence and the conditions of nodes. Remove them from ``single``."""
+    """Join tables that test nodes: their presence, and their conditions in ``single`` (then removed)."""
     for key in scope.nodes:
         if key in nodes and key not in base.present:
             _join_presence(sql, base, key, scope.kinds(key), single.pop(key, []))
@@ -555,7 +555,7 @@ def _join_happened(sql: SqlBuilder, base: Base, happened: Happened, name: str) -
 
 
 def told_kinds(sql: SqlBuilder, scope: Scope, parts: Phases) -> frozenset[str]:
-    """Return the nodes whose kind is in the rows of an edge."""
+    """Return the nodes of an edge whose kind is a column of the edge's rows."""
     if parts.blocks or any(edge.high > 1 for edge in scope.edges):
         return frozenset()
     found = set[str]()
@@ -568,7 +568,7 @@ def told_kinds(sql: SqlBuilder, scope: Scope, parts: Phases) -> frozenset[str]:
 
 
 def _rows(sql: SqlBuilder, scope: Scope, edge: Edge, *, moving: bool, lasting: bool) -> str:
-    """Return SQL for the rows of an edge that is undirected, or in a table of frames and one of maps."""
+    """Return SQL for the rows of an edge, from all of its tables, and in both directions if undirected."""
     directions = (False, True) if edge.both else (False,)
     branches: list[str] = []
     for swapped in directions:
@@ -718,7 +718,7 @@ def _join_presence(
 
 
 def _kinds_to_test(scope: Scope, key: str) -> Kinds:
-    """Return the node kinds that SQL must test in the states. For an ego at an edge, kinds are known."""
+    """Return the node kinds that SQL must test in the states. An edge already tests the kind of the ego."""
     kinds = scope.kinds(key)
     said = any(edge.high == 1 and key in {edge.src, edge.dst} for edge in scope.edges)
     return ego_kinds() if said and kinds.one_a_frame else kinds
@@ -727,7 +727,7 @@ def _kinds_to_test(scope: Scope, key: str) -> Kinds:
 def _join_conditions(
     sql: SqlBuilder, base: Base, key: str, kinds: Kinds, conditions: list[Bound]
 ) -> None:
-    """Join bit masks of the frames in which a node meets its conditions. Its presence is known."""
+    """Join bit masks of the frames in which a node meets its conditions. Its presence is already tested."""
     profile, alias = Profile.of(kinds, sql.catalog), quoted(f"{key}:")
     constant = all(is_constant(leaf) for c in conditions for leaf in leaves(c))
     if profile.mapped and profile.places == 1:

@@ -128,7 +128,7 @@ class Phases:
 
 
 def phases_of(scope: Scope, query: Query, catalog: Catalog) -> Phases:
-    """Group the conditions of a graph pattern by the SQL phase that tests them."""
+    """Group the conditions of a pattern by the phase that tests them: on bit masks of frames, or per frame."""
     parts = Phases()
     for condition in scope.where:
         if stands_alone(condition, catalog):
@@ -223,7 +223,7 @@ def _of_null(condition: Bound) -> bool:
 
 
 def _late(scope: Scope, parts: Phases, query: Query, catalog: Catalog) -> Iterator[str]:
-    """Yield nodes that only the second phase (single frames) joins. They have no edges.
+    """Yield nodes without edges that SQL joins only in single frames, not as bit masks.
 
     Otherwise, all states would be grouped into masks and then expanded again.
     """
@@ -246,7 +246,7 @@ def _late(scope: Scope, parts: Phases, query: Query, catalog: Catalog) -> Iterat
 
 
 def blocked(query: Query) -> frozenset[str]:
-    """Return the nodes from outside the braces that patterns in braces of a query use."""
+    """Return the nodes of outer patterns that patterns in braces of a query use."""
     return frozenset(_blocked((*query.scope.where, *query.result.values)))
 
 

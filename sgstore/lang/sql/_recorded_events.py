@@ -86,6 +86,6 @@ def told_events(kind: str) -> str:
 
 
 def recorded_events(schemas: Iterable[str]) -> frozenset[str]:
-    """Return the kinds of event in recordings whose channels have the given message schemas."""
+    """Return the kinds of event that recordings with the given message schemas can contain."""
     names = tuple(schemas)
     return frozenset(k for k, end in EVENT_SCHEMAS.items() if any(n.endswith(end) for n in names))

@@ -209,7 +209,7 @@ def about_frame(attributes: Sequence[FrameAttribute]) -> str:
 
 
 def named_traces(conditions: Sequence[Bound]) -> tuple[str, list[Any]]:
-    """Return SQL, and its values, for the names of the traces whose attributes meet conditions."""
+    """Return SQL, and its parameter values, for the names of traces with attributes that meet conditions."""
     values = BoundValues()
     select = Select([f'{_TRACE}."name"'])
     select.join(f'"trace" AS {_TRACE}', [])
@@ -374,7 +374,7 @@ class _RowStatement:
         return self._of_group(leaf.name) if isinstance(leaf, GroupKey) else _column(leaf)
 
     def _of_group(self, name: str) -> str:
-        """Return the SQL of a grouping value. A value used twice has the same SQL."""
+        """Return the SQL of a grouping value. If the value occurs again, the same SQL is returned."""
         if name not in self.texts:
             value = next(c.value for c in self.result.columns if c.name == name)
             self.texts[name] = self._text(value)
@@ -419,7 +419,7 @@ class _RowStatement:
         return select.text()
 
     def _named_traces(self, keys: list[str], own: int) -> list[int]:
-        """Return the positions of sort keys that are trace names; none if alphabetical order is right."""
+        """Return the positions of sort keys that are trace names, if these need natural order (2 before 10)."""
         known = [trace.name for trace in self.writer.catalog.traces]
         if known == sorted(known):
             return []
@@ -604,7 +604,7 @@ def _name_of(node: str, query: Query, catalog: Catalog) -> Bound:
 
 
 def _spelled(query: Query, catalog: Catalog) -> Query:
-    """Return a query that builds node names in the outermost SELECT only, which is faster."""
+    """Return a query that builds node names only in the outermost SELECT, because this is faster."""
 
     def spelled(value: Bound) -> Bound:
         match value:

@@ -444,7 +444,7 @@ def chain(scope: Scope, edge: Edge, length: int, *, injective: bool) -> Scope:
 
 
 def labels_from_conditions(scope: Scope, _: Catalog) -> Scope:
-    """Replace conditions such as ``v.kind = 'car'`` or ``v.is_ego`` by labels, which SQL tests faster."""
+    """Replace conditions such as ``v.kind = 'car'`` or ``v.is_ego`` by labels. SQL tests labels faster."""
     nodes, rest = dict(scope.nodes), list[Bound]()
     for condition in scope.where:
         key, kinds = _label(condition)
@@ -558,7 +558,7 @@ def narrowed(scope: Scope, catalog: Catalog) -> Scope:
 def kinds_left(
     scope: Scope, triples: Collection[Triple], held: frozenset[str]
 ) -> dict[str, Kinds] | None:
-    """Return the possible kinds of each pattern node in a store that has the given kinds of edges.
+    """Return the kinds that each pattern node can have in a store with the given kinds of edges.
 
     ``None`` means no match.
     """
@@ -571,7 +571,7 @@ def kinds_left(
 
 
 def _pass(kinds: dict[str, Kinds], edges: list[Edge], ways: list[list[Triple]]) -> bool:
-    """Remove kinds of nodes and edges that the edges of a pattern exclude. True if this changed them."""
+    """Remove the kinds that the edges of a pattern exclude. Return True if at least one was removed."""
     changed = False
     for place, edge in enumerate(edges):
         starts, ends = kinds[edge.src].every, kinds[edge.dst].every
@@ -624,7 +624,7 @@ def ordered(scope: Scope, catalog: Catalog, begin: Iterable[str] = ()) -> Scope:
 
 
 def labels_to_conditions(scope: Scope, _: Catalog) -> Scope:
-    """In braces, replace labels of nodes from outside by conditions on their attributes."""
+    """Inside braces, replace labels of nodes of the outer pattern by conditions on their attributes."""
     return replace(scope, where=tuple(map(_attributes, scope.where)))
 
 

@@ -69,5 +69,5 @@ def runs(masks: str, keys: list[str], apart: list[str]) -> str:
 
 
 def _first_of(mask: str) -> str:
-    """Return SQL for the first frame of a bit mask, which is its lowest bit."""
+    """Return SQL for the first frame of a bit mask, from the position of its lowest bit."""
     return f'"bucket" * 64 + bit_count(("{mask}" & -"{mask}") - 1)'

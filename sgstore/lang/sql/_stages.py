@@ -77,7 +77,7 @@ def _first(sql: SqlBuilder, query: Query, stage: MatchStage) -> SharedRelation:
 
 
 def _late(stage: MatchStage) -> tuple[list[Bound], list[Leaf]]:
-    """Return the conditions of a ``MATCH`` on ``WITH`` values and paths, and the other values in them."""
+    """Return the conditions of a ``MATCH`` on values or paths from ``WITH``, and other values in them."""
     late = [one for one in stage.scope.where if _speaks_of_passed(one)]
     wanted = [leaf for one in late for leaf in leaves(one) if not is_passed_on(leaf)]
     return late, list(dict.fromkeys(wanted))
@@ -156,7 +156,7 @@ def _joined(
 
 
 def _bound(scope: Scope) -> tuple[frozenset[str], frozenset[str]]:
-    """Return the keys of nodes and edges that count: two matches differ if one of them differs."""
+    """Return the keys of nodes and edges that identify a match: two matches differ if one of these differs."""
     nodes = frozenset(key for key, node in scope.nodes.items() if node.role != "hidden")
     return nodes, frozenset(edge.key for edge in scope.edges if edge.named)
 

@@ -41,7 +41,7 @@ class Window:
         return cls(low, high, traces if len(traces) > 1 else None)
 
     def whole(self, extents: Iterable[tuple[int, int]]) -> Window:
-        """Return the window, without its list of traces if its range has no other traces."""
+        """Return the window. Its list of traces is dropped if the range contains no other traces."""
         if self.traces is None:
             return self
         many = sum(self.low <= first < self.high for first, _ in extents)

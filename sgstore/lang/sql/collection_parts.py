@@ -291,7 +291,7 @@ def _per(result: Result, chosen: Sampling | None, hidden: _Hidden) -> Terms:
 
 
 def _value_of(result: Result, per: Bound | str) -> Bound | str:
-    """If a column is given by name, return its expression; return an expression unchanged."""
+    """Return an expression: the given one, or the expression of the column with the given name."""
     if not isinstance(per, str):
         return per
     return next((column.value for column in result.columns if column.name == per), per)

@@ -127,7 +127,7 @@ class ClassQuestion:
 
 
 def class_questions(asked: Query | BoundCheck) -> tuple[ClassQuestion, ...]:
-    """Return the frame classes that a query or a check needs, each once."""
+    """Return the frame classes that a query or a check needs, without duplicates."""
     if isinstance(asked, BoundCheck):
         values = [asked.formula, *(q.where for q in asked.quantifiers if q.where is not None)]
         values += [*asked.scope.where, *([] if asked.reset is None else [asked.reset])]
