@@ -57,7 +57,7 @@ def said_of(of: str, word: str) -> str | None:
 
 
 def places(names: Container[str]) -> frozenset[str]:
-    """Return what a query may have at a place, such as ``label`` or ``comma``, from the allowed terminals.
+    """Return names for what the query may have next, such as ``label`` or ``comma``, from the terminals.
 
     The kinds are ``edge`` (or the end of a pattern), ``value`` (or a condition), ``operator`` (after a
     value), ``time`` (a duration), ``number``, ``label``, ``name``, ``within`` (inside an edge), ``start`` (of
@@ -179,7 +179,7 @@ def _like(word: str, keywords: Iterable[str]) -> str | None:
 
 
 def _joined(found: str, before: str, at: frozenset[str]) -> str | None:
-    """If a word directly follows a value, return a hint: a wrong keyword, or no comma or ``AND`` between."""
+    """If a word directly follows a value, return a hint: a wrong keyword, or a missing comma or ``AND``."""
     last = re.search(r"(\w+)\s*$", before)
     if last and (like := _like(last[1], _PREFIXES)):
         return f"did you mean {like}?"

@@ -272,7 +272,7 @@ def _shown(found: str) -> str:
 
 
 def _leads_on(machine: Tables, stack: list[_StackEntry], name: str) -> bool:
-    """True if the parser accepts a terminal as the next one."""
+    """True if the parser accepts a terminal symbol (kind of token) as the next one."""
     states = [entry.state for entry in stack]
     while (action := machine.states[states[-1]].get(name)) is not None:
         if action >= 0:
@@ -286,7 +286,7 @@ def _leads_on(machine: Tables, stack: list[_StackEntry], name: str) -> bool:
 
 
 def _listed(machine: Tables, names: list[str]) -> str:
-    """Return the terminals that the parser expects as words for an error message.
+    """Return the terminal symbols that the parser expects, as words for an error message.
 
     Operators form a group, as do starts of values.
     """

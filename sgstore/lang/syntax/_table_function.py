@@ -111,7 +111,7 @@ def topic_tables(sql: str) -> str:
 
 
 def topics_in_sql(sql: str) -> list[str]:
-    """Return the topics whose views an SQL statement uses, without duplicates.
+    """Return the topics that an SQL statement reads as views, without duplicates.
 
     Examples
     --------

@@ -25,7 +25,7 @@ _WORD: Final = re.compile(r"\w")
 
 @dataclass(frozen=True, slots=True)
 class Terminal:
-    """Terminal symbol of the query grammar, given by a fixed text or by a pattern.
+    """Terminal symbol (smallest unit) of the query grammar: a fixed text or a pattern.
 
     Attributes
     ----------

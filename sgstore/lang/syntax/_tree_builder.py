@@ -330,7 +330,7 @@ def rule_temporal_pair(_: TextSpan, children: Children) -> s.Temporal:
 
 
 def rule_bound(span: TextSpan, children: Children) -> tuple[Any, Any]:
-    """Return start and end of a time bound: ``[0s, 2s]``; or ``WITHIN 2s``, whose start is 0."""
+    """Return start and end of a time bound such as ``[0s, 2s]``. For ``WITHIN 2s``, the start is 0."""
     (found,) = children
     if isinstance(found, s.Duration | s.Parameter):
         return s.Duration(0, "s", span), found

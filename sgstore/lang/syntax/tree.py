@@ -45,7 +45,7 @@ class Duration:
 
 @dataclass(frozen=True, slots=True)
 class FrameWindow:
-    """Time window around a frame, such as ``-1s..2s``: from ``before`` it to ``ahead`` of it."""
+    """Time window around a frame, such as ``-1s..2s``: its length ``before`` and ``ahead`` of the frame."""
 
     before: Duration
     ahead: Duration
