@@ -155,7 +155,7 @@ def _made(
     around_s: float,
     pictures: bool,  # noqa: FBT001 - as report has it
 ) -> tuple[str, int, bool]:
-    """Return an HTML page of matches and the number of matches. True: the query has more matches."""
+    """Return an HTML page of matches, their number, and True if the query has more matches."""
     with store.file.snapshot():
         kept, found, truncated = _kept(store, text, dict(parameters or {}), most, around_s)
         if pictures:
@@ -166,7 +166,7 @@ def _made(
 def _kept(
     store: Store, text: str, values: dict[str, Any], most: int, around_s: float
 ) -> tuple[dict[str, Any], list[Found], bool]:
-    """Return the data of a report page for JSON, and its matches. True: the query has more matches."""
+    """Return the data of a report page for JSON, its matches, and True if the query has more matches."""
     is_check = re.match(r"\s*(?:--[^\n]*\n\s*)*(?:DEFINE\b[^;]*;\s*)*CHECK\b", text, re.IGNORECASE)
     question = {"text": text, "parameters": values}
     asked = {"ask": "check" if is_check else "matches", "absent": True, **question}

@@ -538,7 +538,7 @@ def _one_line(text: str) -> str:
 
 
 def _first_lines(lines: Sequence[str]) -> str:
-    """Return the first lines of a long text, with a note on the others."""
+    """Return the first lines of a long text, and a note that states how many lines are left out."""
     sizes = accumulate(len(one) + 1 for one in lines)
     shown = max(sum(size <= MOST_TEXT for size in sizes), 1)
     rest = max(len(lines) - shown, 0)

@@ -57,7 +57,7 @@ def _listed(
 def _listed_first(
     columns: Sequence[str], rows: Iterable[Sequence[Any]], limit: int, **about: Any
 ) -> Reply:
-    """Return a reply with at most ``limit`` rows. At most one more row is read."""
+    """Return a reply with at most ``limit`` rows. It reads one row more, to know if there are more."""
     found = list(islice(rows, limit + 1))
     return _cut(columns, found[:limit], truncated=len(found) > limit) | about
 

@@ -420,7 +420,7 @@ def _fraction(text: str) -> float:
 def _report_below(
     shares: ReportTable, listed: ReportTable, ask: FrameAskOptions, limit: int | None
 ) -> None:
-    """Print a table of items. First print the notes of the table of shares, which is not printed itself."""
+    """Print the notes of a table of shares, then a table of items."""
     for text in shares.said if listed is not shares else ():
         say(text)
     ask.report(listed, limit)

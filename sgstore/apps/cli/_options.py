@@ -204,7 +204,7 @@ def renamed(verb: Verb, ctx: Any, args: list[str]) -> list[str]:
 
 
 def _means_files(path: str, args: Sequence[str]) -> bool:
-    """True if an old ``--format`` selects the format of written files; False for the format of printed rows."""
+    """True if the old option ``--format`` selects the format of written files; False for printed rows."""
     if any(one == "--as" or one.startswith("--as=") for one in args):
         return False
     values = [value for name, value in pairwise(args) if name == "--format"]
@@ -228,7 +228,7 @@ def _show_plainly(parameter: Any, ctx: Any) -> None:
 
 @cache
 def examples() -> dict[str, list[str]]:
-    """Return the examples in the help of each command: the rest of a command line, and its purpose."""
+    """Return the examples for the help of each command: the rest of the command line, and its purpose."""
     text = resources.files("sgstore.apps.cli").joinpath("examples.toml").read_text(encoding="utf-8")
     return tomllib.loads(text)
 
@@ -325,7 +325,7 @@ def _words_of(verb: Verb) -> list[str]:
 
 
 def _commands_with(command: Any, option: str, path: tuple[str, ...] = ()) -> list[str]:
-    """Return the commands of a group, and of its groups, that have an option."""
+    """Return those commands of a group, and of the groups inside it, that have an option."""
     inner = getattr(command, "commands", None)
     if inner is None:
         return [" ".join(path)] if option in _words_of(command) else []

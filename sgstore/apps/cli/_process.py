@@ -83,7 +83,7 @@ def _hear_of_lost() -> None:
 
 
 def _lost(report: Any) -> None:
-    """Handle an exception that Python could only report. A keyboard interrupt is raised again soon after."""
+    """Handle an exception that Python could only report. A keyboard interrupt is raised again later."""
     if not issubclass(report.exc_type, KeyboardInterrupt):
         _run.reported(report)
         return

@@ -344,7 +344,7 @@ _FEATURES_SHOWN: Final = 3
 
 
 def _differing(features: dict[str, int]) -> str:
-    """Return a text with the first few differing features, their counts, and the number of the others."""
+    """Return a text with the first few differing features and their counts, and how many more differ."""
     shown = [f"{n} x {text}" if n > 1 else text for text, n in features.items()]
     more = shown[_FEATURES_SHOWN:]
     return ", ".join([*shown[:_FEATURES_SHOWN], *([f"… {len(more)} more"] if more else [])])

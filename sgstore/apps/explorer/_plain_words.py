@@ -59,7 +59,7 @@ def relation_words(relation: str) -> str:
 
 
 def feature_words(text: str, relations: frozenset[str]) -> str:
-    """Return features in words: one, or several with ``&`` between them.
+    """Return one feature, or several joined with ``&``, in words.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def _one_feature(text: str, relations: frozenset[str]) -> str:
 
 
 def plain_sentence(text: str) -> str:
-    """Return a sentence with ``kind of scene`` in place of ``class``."""
+    """Return a sentence in which ``kind of scene`` replaces the term ``class``."""
     for word, plain in _CLASSES:
         text = word.sub(plain, text)
     return text

@@ -104,7 +104,7 @@ def _text(value: object, name: str) -> str:
 
 
 def _ticks(value: object, name: str) -> str:
-    """Validate a selection of matches: a text in the form that the address of the page contains."""
+    """Validate a selection of matches, given as text in the form of the page address."""
     if not isinstance(value, str) or not _TICKS.fullmatch(value):
         raise RequestError(f"{name}: expected ticked matches as in the address of the page")
     return value

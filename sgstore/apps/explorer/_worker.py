@@ -29,7 +29,7 @@ BATCH_ROWS: Final = 500
 
 
 def _told_matches(store: Store, question: dict[str, Any], most: int) -> Iterator[Reply]:
-    """Yield the replies to a pattern query: column names and traces without an answer, then the matches.
+    """Yield the replies to a pattern query: columns, then traces that cannot answer it, then matches.
 
     If rows are values of several matches, there is one reply with the rows instead.
     """
@@ -82,7 +82,7 @@ def _told_parts(store: Store, question: dict[str, Any], _: int) -> Iterator[Repl
 
 
 def _told_values(store: Store, question: dict[str, Any], _: int) -> Iterator[Reply]:
-    """Yield the values that the conditions of a pattern compare in a frame, by lane and condition."""
+    """Yield the values that the conditions of a pattern compare in a frame, by pattern and condition."""
     text, frame, binding = question["text"], question["frame"], question["binding"] or {}
     yield told_values(store.condition_values(text, frame, binding, **question["parameters"]))
 
