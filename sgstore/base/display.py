@@ -121,7 +121,7 @@ def excerpt(text: Any) -> str:
 
 
 def excerpts(names: Sequence[str], most: int = 8) -> str:
-    """Return the first names of a store as text for a message, with the number of the others."""
+    """Return names of a store as text for a message: the first few, and the number of the others."""
     return first_of([*map(excerpt, names[:most]), *names[most:]], most)
 
 

@@ -262,7 +262,7 @@ def written(to: str | Path) -> Generator[BinaryIO]:
 
 @contextmanager
 def written_text(to: str | Path) -> Generator[TextIO]:
-    """Context manager that yields a UTF-8 text stream.
+    """Context manager to write a UTF-8 text file. The file appears only when it is complete.
 
     The file appears complete at the end. Line ends stay, and invalid characters become escapes.
     """

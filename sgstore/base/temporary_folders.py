@@ -151,7 +151,7 @@ def _remove_dead(folder: Path, undo: Callable[[Path], None] | None) -> None:
 
 
 def sweep_temporary() -> None:
-    """Remove the folders for temporary files whose processes have ended."""
+    """Remove the temporary folders of processes that have ended."""
     sweep(_root(), PREFIX)
 
 
