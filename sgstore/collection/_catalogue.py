@@ -208,7 +208,7 @@ class Snapshot:
         return found
 
     def fields_of_some(self, topic: str) -> dict[str, int]:
-        """For each field of a topic, return how many bundles (store files) lack it; 0 is left out."""
+        """Return how many bundles (store files) lack each topic field. Fields in all bundles are left out."""
         with_field: dict[str, set[str]] = {}
         for bundle, what, word, _, _ in self.facts["word"]:
             if what == "topic" and json.loads(word)[0] == topic:
@@ -275,7 +275,7 @@ class Snapshot:
     def triples(
         self, name: str, matters: Callable[[Triple], bool], *, world: bool
     ) -> dict[str, frozenset[Triple]]:
-        """For each bundle (store file), return the triples (kind, relation, kind) that can matter for a query.
+        """Return the triples (kind, relation, kind) in each bundle (store file) that a query can use.
 
         The relations are those of a derived set, or of the ingest.
 
@@ -334,14 +334,14 @@ class Snapshot:
 
     @cached_property
     def sets(self) -> dict[str, list[tuple[Any, ...]]]:
-        """Return the catalogue rows of each derived set of relations, by name."""
+        """Return the catalogue rows of each set of relations that ``derive`` made, by name."""
         found: dict[str, list[tuple[Any, ...]]] = {}
         for row in self.facts["set"]:
             found.setdefault(row[1], []).append(row)
         return found
 
     def _derived(self, name: str, bundles: frozenset[str], whole: Catalog) -> Catalog:
-        """Return a catalog for a derived set of relations. It covers only the traces that have this set."""
+        """Return a catalog for a set of relations that ``derive`` made, for the traces with this set."""
         held = self.contents([*bundles], name)
         own = {row[2]: row for row in self.sets[name] if row[0] in bundles}
         traces = tuple(
@@ -369,7 +369,7 @@ class Snapshot:
         )
 
     def relations_of(self, name: str) -> frozenset[str] | None:
-        """Return the relations that a derived set can contain in the stores of the collection.
+        """Return the relations that a set made by ``derive`` can contain in the stores of the collection.
 
         ``None`` means unknown.
         """

@@ -72,7 +72,7 @@ _OF_QUESTIONS: Final = (QueryError, SqlError, AbstractionError, ConfigError)
 
 
 def refusal(task: Task, error: SgstoreError) -> Outcome:
-    """Return the result of a failed task. The error is one that would occur again at a retry."""
+    """Return the result of a failed task. It marks an error that a retry would repeat."""
     outcome = {"bundle": task["bundle"], "error": str(error)}
     return outcome | ({"wrong": plain_error(error)} if isinstance(error, _OF_QUESTIONS) else {})
 

@@ -110,7 +110,7 @@ class _Landing:
     maps: set[str] = field(default_factory=set[str])
 
     def landed(self, paths: list[Path], share: int, of: int, jobs: int) -> list[TraceOutcome]:
-        """Ingest one share of the recordings, number ``share`` of ``of``. Write the segment files."""
+        """Ingest share number ``share`` of ``of`` shares of the recordings. Write a segment file per trace."""
         Maps(self.job.road_map, self.job.config.signs)  # an unreadable map stops the run early
         found: dict[int, list[TraceOutcome]] = {}
         wanted: dict[int, tuple[Path, str]] = {}

@@ -545,7 +545,7 @@ class Collection(StoreVerbs):
     def _held(
         self, catalog: Catalog, pruning: Pruning
     ) -> Callable[[str], tuple[frozenset[Triple], Sequence[frozenset[str]]]]:
-        """Return a function: store name → the triples that can matter for a query, and the kinds of nodes."""
+        """Return a function: store name → triples (kind, relation, kind) for the query, and node kinds."""
         snapshot, name, world = self.snapshot, catalog.name, catalog.world
         if name and name not in snapshot.sets:
 
@@ -568,7 +568,7 @@ def _similar(values: dict[str, Any]) -> SimilarFrames:
 
 
 def _facts_of_table(name: str, told: Mapping[str, Any]) -> TableFacts:
-    """Return what the query compiler needs from a user table, such as how its rows match frames."""
+    """Return the data on a user table that the query compiler needs, such as how its rows match frames."""
     refused = None
     if not told["joins"]:
         refused = "no rows that belong to frames"
@@ -646,7 +646,7 @@ class CollectionMatches(TemporalMatches):
 
     @property
     def scope(self) -> dict[str, Any]:
-        """Return which data the ingest settings excluded from the queried traces, as JSON values."""
+        """Return which data the ingest settings excluded from the traces of the query, as JSON values."""
         chosen = (trace.trace_id for trace in self._ready.chosen)
         return self.snapshot.scope(world=self._ready.bound.world, traces=chosen)
 
@@ -720,7 +720,7 @@ class CollectionMatches(TemporalMatches):
                     yield row
 
     def written_apart(self, to: Path) -> PartFile:
-        """Write the rows of this query to a file, for a ``UNION``. More columns distinguish equal node ids."""
+        """Write the rows of this part of a ``UNION`` to a file. More columns distinguish equal node ids."""
         asked = parted(self._ready, "apart")
         with self._tables("apart", (0, 0)) as tables:
             statement = asked.statement(self._ready.catalog)
@@ -765,7 +765,7 @@ class CollectionUnion(UnionMatches):
 
     @property
     def scope(self) -> dict[str, Any]:
-        """Return which data the ingest settings excluded from the traces of all parts, as JSON values."""
+        """Return which data the ingest settings excluded from the traces of the union, as JSON values."""
         parts = [part._ready for part in self._parts]  # noqa: SLF001
         chosen = {trace.trace_id for one in parts for trace in one.chosen}
         snapshot = self._parts[0].snapshot
@@ -1017,7 +1017,7 @@ class CollectionFrames:
 
     @property
     def abstracted(self) -> Self:
-        """Return this object, which also has the methods for abstractions."""
+        """Return this object itself. It also has the methods for abstractions of graphs."""
         return self
 
     def snapshot(self) -> AbstractContextManager[object]:

@@ -159,7 +159,7 @@ _catalogs: Final[dict[tuple[Path, str], tuple[Catalog, Catalog]]] = {}
 
 @contextmanager
 def _opened(task: dict[str, Any], held: Path) -> Generator[StoreFile]:
-    """Open a bundle (store file). For user tables and user SQL, the store is opened separately."""
+    """Open a bundle (store file) for a task. It stays open later, unless the user adds tables or SQL."""
     if task["bundle"] == EMPTY:
         path = held / "empty.sgstore"
         StoreFile.create(path).close()
@@ -411,7 +411,7 @@ def like_in(store: Store, example: dict[str, Any], **how: Any) -> list[dict[str,
 
 
 def _carry(found: dict[str, Any]) -> None:
-    """Put the content of result files into the result, because the caller runs on another machine."""
+    """Put the content of result files into the result, for a caller on another machine."""
     for part in found.get("parts", ()):
         if not part["path"]:
             continue
