@@ -330,7 +330,7 @@ def _compared(groups: Sequence[str], count: int) -> tuple[slice, slice]:
 def _one_direction(
     names: Sequence[str], frames: NDArray[np.int64], wanted: NDArray[np.bool_]
 ) -> NDArray[np.intp]:
-    """Return indices of features. Of features that occur in exactly the same frames, only one is returned."""
+    """Return indices of features. If features occur in exactly the same frames, only one is returned."""
     order = np.array(
         sorted(range(len(names)), key=lambda i: not names[i].startswith("ego ")), np.intp
     )

@@ -271,7 +271,7 @@ def _is_closed(ring: Floats) -> bool:
 
 
 def _chevrons(line: Floats) -> list[Floats]:
-    """Return arrow heads at equal distances along a line; each is a line. A short line has none."""
+    """Return arrow heads, as lines, at equal distances along a line. A short line has none."""
     steps = np.hypot(*np.diff(line, axis=0).T)
     along = np.concatenate(((0.0,), np.cumsum(steps)))
     count = round(along[-1] / DrawnOutlines.ARROW_SPACING)

@@ -393,7 +393,7 @@ def _pen(scene: DrawnFrame, link: DrawnLink) -> tuple[str, float, dict[str, Any]
 
 
 def _paint_halo(stage: Stage, scene: DrawnFrame, node: int) -> None:
-    """Draw a yellow mark around a matched node, except a map part with an outline, which is coloured."""
+    """Draw a yellow mark around a matched node. Map parts with an outline are coloured instead."""
     place = scene.place(node)
     if place is None or (node not in scene.bodies and scene.has_outline(node)):
         return
