@@ -352,7 +352,7 @@ class _Writing:
         return f"{self.folder.name}/{name}", holds, form, "", digest
 
     def _begin(self, row: _FrameMessage, video: Sensed) -> File | None:
-        """Start a video file. Write the last key frame before a picture, and all pictures from there to it."""
+        """Start a video file. Write all pictures from the last key frame up to the given picture."""
         try:
             carried = self.export.store.file.carried(row.frame_id, row.channel)
         except (TraceError, StoreError) as error:

@@ -172,7 +172,7 @@ def _over_matches(
 def _answers(
     store: Store | Collection, text: str, wanted: Ints, parameters: Mapping[str, object]
 ) -> Iterator[tuple[Ints, np.ndarray[Any, np.dtype[np.object_]]]]:
-    """Yield frame indices and the values of an expression there: first for frames with an ego, then others."""
+    """Yield frame indices with values of an expression: first for frames with an ego, then for others."""
     value = f"{text}) AS label"
     try:
         matches = store.find(_OF_EGO + value, **parameters)
@@ -207,7 +207,7 @@ def _of_expression(error: QueryError, text: str) -> QueryError:
 
 
 def _columns(matches: Matches, wanted: Ints) -> tuple[Ints, np.ndarray[Any, np.dtype[np.object_]]]:
-    """Return the indices of the wanted frames in which a query matches, and the values of these matches."""
+    """Return the indices of the wanted frames in which a query matches, and the values of the matches."""
     found = matches.numpy()
     of, row = _rows(wanted, found["frame_of_label"].astype(np.int64))
     values = found["label"].astype(object)
@@ -216,7 +216,7 @@ def _columns(matches: Matches, wanted: Ints) -> tuple[Ints, np.ndarray[Any, np.d
 
 
 def _rows(wanted: Ints, frame_id: Ints) -> tuple[Ints, Ints]:
-    """Return the positions in ``frame_id`` of the wanted frames, and their indices in ``wanted``."""
+    """Return the given frames' positions in ``frame_id``, and their indices in ``wanted``."""
     row = np.minimum(np.searchsorted(wanted, frame_id), max(len(wanted) - 1, 0))
     of = np.flatnonzero(wanted[row] == frame_id) if len(wanted) else row[:0]
     return of, row[of]

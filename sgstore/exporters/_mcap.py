@@ -149,7 +149,7 @@ def _survey(recording: RecordingFile, trace: StoredTrace, context: MessageRefs) 
 def _context_of(
     refs: MessageRefs, reach: Clip
 ) -> tuple[dict[int, list[int]], set[tuple[int, int]]]:
-    """Return messages outside a clip on which its frames depend, such as the road map.
+    """Return messages outside a clip that the clip's frames need, such as the road map.
 
     Context from before the start is included. If the context of a channel begins only after the
     end, as for a map that is recorded last, its first message is included, unless the clip has
@@ -374,7 +374,7 @@ class _Cutting:
 
 
 def _among(run: Messages, places: dict[int, list[int]]) -> NDArray[np.bool_]:
-    """True for each message whose position is in ``places`` (offset of the chunk → offsets of messages)."""
+    """True for each message whose position is in ``places`` (chunk offset → message offsets)."""
     chunks, found = run.chunks, np.zeros(len(run), np.bool_)
     for chunk in np.unique(chunks).tolist():
         found |= (chunks == chunk) & np.isin(run.offset, places.get(chunk, ()))

@@ -141,7 +141,7 @@ def _write_graphml(graph: Graph, file: Path) -> None:
 
 
 def _drawable(about: dict[str, Any]) -> dict[str, Any]:
-    """Return attributes for GraphML: numbers and truth values are unchanged, other values become texts."""
+    """Return attributes for GraphML. Numbers and truth values stay the same; other values become texts."""
     return {
         name: value if isinstance(value, (bool, int, float)) else _readable(str(value))
         for name, value in about.items()

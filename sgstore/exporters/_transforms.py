@@ -48,7 +48,7 @@ TOLD: Final = frozenset(
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """Constant pose (position and rotation) of a sensor relative to the ego, or of axes relative to others.
+    """Constant pose (position and rotation) of a sensor on the ego, or of coordinate axes in other axes.
 
     Attributes
     ----------

@@ -60,7 +60,7 @@ def layout(channels: Sequence[ChannelCount], ego: str) -> str:
 
 
 def _topics(channels: Sequence[ChannelCount], endings: tuple[str, ...]) -> list[str]:
-    """Return the topics of channels that contain messages and whose message type is one of the given ones."""
+    """Return the topics of those channels that contain messages of one of the given types."""
     found = [
         one.topic
         for one in channels

@@ -360,7 +360,7 @@ class GraphDataset:
 
 
 def _renumbered(own: list[str], wanted: list[str], folder: str | Path) -> NDArray[np.int64]:
-    """For each name in ``own``, return its index in ``wanted``. Raise an error for a missing name."""
+    """For each name in ``own``, return its index in the list ``wanted``. A missing name raises an error."""
     place = {name: i for i, name in enumerate(wanted)}
     missing = [name for name in own if name not in place]
     if missing:
