@@ -105,7 +105,7 @@ class Entity(NamedTuple):
         return self.kind, self.special, self.subkind
 
     def meant(self, told: TypeMeaning | None) -> Entity:
-        """Return the object with the kind that the type mapping defines; unchanged without a mapping."""
+        """Return the object with the kind that the type mapping has for it; unchanged without a mapping."""
         if told is None:
             return self
         kind = KIND_CODE[told.kind]
@@ -614,7 +614,7 @@ class Records:
             self._map = MapRecords(about, edges.src, edges.relation, edges.dst, reach)
 
     def stand(self, known: EntityConstants, states: States, row: int) -> None:
-        """Remember the attributes of a static object, because a recording contains its pose only once."""
+        """Remember the attributes of a static object: a recording contains the object's pose only once."""
         numbers = {name: float(getattr(states, name)[row]) for name in _BOX}
         numbers["heading"] = float(np.degrees(wrapped(states.heading[row])))
         about = known.attributes(is_ego=False, is_static=True)
@@ -1063,7 +1063,7 @@ class GcPaused:
 
 
 def entities_of(first: int, new: list[Entity]) -> Entities:
-    """Return the table of new entities. ``first`` is the number of the first of them."""
+    """Return the table of new entities. ``first`` is the number of the first new entity."""
     names = ("ident", "special", "subkind", "type_name", "map_ref", "trailer")
     return Entities(
         first=first,

@@ -164,7 +164,7 @@ class SymmetrySearch:
 
 
 def _telling(arcs: Arcs, colour: dict[int, int], sizes: Counter[int]) -> Arcs:
-    """Return the edges of a graph without those that exist between all nodes of two colours."""
+    """Return the edges of a graph without those that connect every node of one colour with all of another."""
     many = Counter(
         (colour[src], label, colour[dst]) for src, to in arcs.items() for dst, label in to.items()
     )
@@ -524,7 +524,7 @@ def _ordered(block: _Block, colour: Words, work: int) -> tuple[Ints, Bools]:
 
 
 def _components_of_block(block: _Block, cell: Ints, size: Ints) -> Ints:
-    """Return the component of each node. Only edges that can distinguish equal colours join components."""
+    """Return the component of each node: nodes joined by edges that can distinguish nodes of equal colour."""
     src, dst = block.src, block.dst
     rows = np.flatnonzero((src != dst) & (size[cell[src]] > 1) & (size[cell[dst]] > 1))
     if not len(rows):

@@ -96,7 +96,7 @@ def _in_loops(scene: BlockScene) -> bool:
 
 
 def _looking(scene: BlockScene, rows: Rows, codes: Codes) -> Edges:
-    """Return direction edges for some pairs (a, b). Each edge begins at b, which a sees in this direction."""
+    """Return direction edges for some pairs (a, b). An edge begins at b; its direction is seen from a."""
     a, b = scene.pairs.some(rows)
     return edges_between(scene, codes, b, a)
 
@@ -104,7 +104,7 @@ def _looking(scene: BlockScene, rows: Rows, codes: Codes) -> Edges:
 def _sectors(
     scene: BlockScene, bounds: tuple[Floats, Floats], names: Codes
 ) -> tuple[Columns, int, Rows]:
-    """Return the direction edges of all pairs, and the pairs near a limit, which need an exact angle."""
+    """Return the direction edges of all pairs, and those pairs near a limit that need an exact angle."""
     pairs = scene.pairs
     codes, holds = np.empty(len(pairs), np.int8), np.empty(len(pairs), np.bool_)
     ahead, left = pairs.offsets

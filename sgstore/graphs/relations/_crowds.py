@@ -33,7 +33,7 @@ _WIDEST: Final = 1 << 20
 
 
 def pieces(frames: FrameBlock, kinds: Codes, config: Config, egos: int) -> Iterator[FrameBlock]:
-    """Split a block of frames so that no part has too many object pairs. Usually, there is one part.
+    """Split a block of frames into parts with fewer object pairs, to limit memory. Usually, one part is enough.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def pieces(frames: FrameBlock, kinds: Codes, config: Config, egos: int) -> Itera
 
 
 def _neighbours(frames: FrameBlock, rows: Rows, config: Config) -> Ints:
-    """Return an estimate, never too small, of the number of near object pairs in each frame, (F,)."""
+    """For each frame, return an upper bound for the number of near object pairs, (F,)."""
     states = frames.states
     reach = max(config.pairs.within, 1.0)
     size = np.nan_to_num(np.hypot(states.length, states.width)[rows])

@@ -353,7 +353,7 @@ def _sorted(tables: Sequence[_Candidates]) -> _Candidates:
 
 
 def _filled(of: _Candidates, run: Ints) -> tuple[_Candidates, Ints]:
-    """If a vehicle leaves a lane and touches it again, add it to the frames between, with a high cost."""
+    """If a vehicle touches a lane again, make the lane a candidate in the frames between, at a high cost."""
     new = begins(run, of.seq)
     frame, first = np.cumsum(new) - 1, np.flatnonzero(new)
     order = np.lexsort((frame, of.lane, run))
@@ -439,7 +439,7 @@ class _Crossings:
         return (toll == JUMP) & (fits | (more < OPEN)) | (toll == SIDE) & (fits | (more < BESIDE))
 
     def chosen(self, cost: Floats, others: Bools) -> tuple[Ints, Ints]:
-        """Return the rows of states in junctions, and the chosen lane of each as in ``States``.
+        """Return the rows of states in junctions, and the lane chosen for each, in the form of ``States``.
 
         ``others`` are the candidates that make a choice unsure.
         """

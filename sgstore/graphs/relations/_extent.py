@@ -456,7 +456,7 @@ def _as_boxes(ends: Floats) -> Floats:
 
 
 def _pieces(road_map: RoadMap, lane: Ints, begin: Floats, end: Floats) -> tuple[Rows, Floats]:
-    """Return centre lines between two lengths along them, as straight pieces: line, and ends (S, 2, 2)."""
+    """Return parts of centre lines as straight pieces: the index of the line, and both ends (S, 2, 2)."""
     ribbons = road_map.ribbons
     owner, row = spread(ribbons.offsets[lane], np.diff(ribbons.offsets)[lane] - 1)
     here = (ribbons.along[row] < end[owner]) & (ribbons.along[row + 1] > begin[owner])

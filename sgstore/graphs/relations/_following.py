@@ -55,7 +55,7 @@ SAME_WAY: Final = np.pi / 4
 
 @dataclass(frozen=True, slots=True)
 class OwnLanes:
-    """Vehicles on their own lanes, sorted by frame, lane and position on the lane; shape (N,).
+    """Vehicles on the lanes that they drive on, sorted by frame, lane and position on the lane; shape (N,).
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class OwnLanes:
 
 
 def own_hits(net: LaneNet, bodies: Bodies, hits: LaneHits) -> Bools:
-    """Return a mask of touched lanes: True if the lane is an own lane of the object."""
+    """Return a mask of touched lanes: the primary lane of each object, and parallel lanes in its junction."""
     lane = -2 - hits.lane
     junction = np.full(len(bodies), -1)
     junction[hits.row[hits.primary]] = net.junction[lane[hits.primary]]
@@ -96,7 +96,7 @@ def own_hits(net: LaneNet, bodies: Bodies, hits: LaneHits) -> Bools:
 
 
 def own_lanes(net: LaneNet, bodies: Bodies, standing: Standing) -> OwnLanes:
-    """Return the vehicles on their own lanes that face in the direction of the lane."""
+    """Return the vehicles on the lanes that they drive on, if they face in the direction of the lane."""
     hits = standing.hits
     lane = -2 - hits.lane
     own = standing.own & (np.abs(hits.heading_error) < np.pi / 2)
@@ -141,7 +141,7 @@ def next_ahead(net: LaneNet, bodies: Bodies, standing: Standing, limit: float) -
 def following(
     net: LaneNet, bodies: Bodies, standing: Standing, limit: float
 ) -> tuple[Column, Rows]:
-    """Return the certain pairs of :func:`next_ahead`, and the vehicles whose next vehicle is uncertain."""
+    """Return only the certain pairs of :func:`next_ahead`, and the vehicles without a certain one."""
     found = next_ahead(net, bodies, standing, limit)
     if not len(standing.unsure):
         return found, standing.unsure
@@ -183,7 +183,7 @@ def _beyond(net: LaneNet, own: OwnLanes, limit: float) -> list[Column]:
 
 
 def _nearer(key: Ints, distance: Floats, best: Best) -> tuple[Rows, Best]:
-    """For each key, return the row that is nearer than the best so far, and the new best distances."""
+    """For each key, return the row with the smallest distance, if below the best so far; and the new best."""
     known, least = best
     place = np.minimum(np.searchsorted(known, key), max(len(known) - 1, 0))
     again = known[place] == key if len(known) else np.zeros(len(key), np.bool_)

@@ -54,7 +54,7 @@ _IS_TWO_WHEELER: Final = kinds_mask(tuple(SUPER_KINDS["two_wheeler"]))
 
 
 class Hitches:
-    """Carriers in a trace, such as the towing vehicle of a trailer, or the bicycle of a rider."""
+    """Carriers in a trace: objects that pull or carry others, such as a towing vehicle or a ridden bicycle."""
 
     def __init__(self) -> None:
         self._kind: Codes = np.zeros(0, np.int8)
@@ -104,7 +104,7 @@ class Hitches:
         return self._parted(bodies, frames, rows, found) if len(rows) else found
 
     def _meet(self, bodies: Callable[[Rows], Bodies], rows: Rows, node: Ints) -> None:
-        """Find carriers: objects that touch a possible load in the first frame that has both."""
+        """Find carriers: objects that touch a possible load in the first frame in which both occur."""
         of = bodies(rows)
         first = _first(of.node, of.frame, len(self._seen))
         first[self._seen] = -1
@@ -119,7 +119,7 @@ class Hitches:
             self._carrier[of.node[one[order]]] = of.node[other[order]]
 
     def _fits(self, of: Bodies, one: Rows, other: Rows) -> Bools:
-        """Return a mask of the object pairs whose second object can carry the first."""
+        """Return a mask of the pairs of objects in which the second can carry or pull the first."""
         dx, dy = of.x[other] - of.x[one], of.y[other] - of.y[one]
         ahead, _ = offsets(dx, dy, of.heading[one])
         pulled = (of.kind[one] == _TRAILER) & IS_VEHICLE[of.kind[other]] & (ahead > 0)
@@ -154,7 +154,7 @@ def new_frames(frames: FrameBlock, new: Bools) -> Bools:
 
 
 def _first(node: Ints, frame: Ints, count: int) -> Ints:
-    """Return the first frame of each node, (count,); -1 for a node that does not occur."""
+    """Return the first frame of each node id from 0 on, (count,); -1 for a node that does not occur."""
     first = np.full(count, -1)
     order = np.lexsort((-frame, node))
     first[node[order]] = frame[order]

@@ -160,7 +160,7 @@ class Centrelines:
         return before + np.where(out, onward, share[at]) * (after - before)
 
     def _near(self, lane: Ints, x: Floats, y: Floats) -> tuple[Rows, Rows]:
-        """Return pairs of a position and a piece of its lane's centre line that may be the nearest piece."""
+        """Return pairs: a position, and a piece of its lane's centre line that may be nearest to it."""
         first, count = self._first_run[lane], self._runs[lane]
         owner, run = spread(first, count)
         away = np.hypot(

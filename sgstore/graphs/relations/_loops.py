@@ -104,7 +104,7 @@ def sectors(
     columns: Columns,
     doubtful: Ints,
 ) -> tuple[int, int]:
-    """Write the direction edges of object pairs. Return their number, and that of pairs needing an exact angle.
+    """Write the direction edges of object pairs. Return two counts: edges, and pairs that need an exact angle.
 
     ``bounds`` are sines and cosines. Pairs from ``len(a)`` on are mirror images.
     """

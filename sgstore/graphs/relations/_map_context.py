@@ -229,7 +229,7 @@ class LaneContact:
 
 
 def driven(hits: LaneHits, lane: Ints, same: Ints) -> tuple[LaneHits, Bools]:
-    """Return touched lanes with the driven lane as primary lane, and a mask of the certain rows.
+    """Return touched lanes with the driven lane as primary lane, and a mask: the driven lane is certain.
 
     ``same`` is the first section of the same lane, as a column, for each map node. A driven lane
     that the footprint does not touch does not count, unless it touches another section.
@@ -305,7 +305,7 @@ class _Footing:
 
 
 def _runs(node: Ints, frame: Ints, box: Floats) -> tuple[Rows, Rows]:
-    """Return, for each row, the first row since which its box is unchanged, and the last row of each node."""
+    """For each row, return the first row from which its box is unchanged, and the last row of each object."""
     order = np.lexsort((frame, node))
     node, bits = (
         node[order],
@@ -322,6 +322,6 @@ def _runs(node: Ints, frame: Ints, box: Floats) -> tuple[Rows, Rows]:
 
 
 def _looked_up(table: Table, wanted: Rows) -> Table:
-    """Return the table rows that belong to the wanted objects."""
+    """Return the table rows of those objects that are looked up."""
     owner, index = joined(table[0], wanted)
     return (owner, *(column[index] for column in table[1:]))

@@ -119,7 +119,7 @@ def _behind(pairs: Halves, others: Halves, rows: Rows) -> Halves:
 def of_kinds(
     bodies: Bodies, ego: Rows, pairs: Halves, kinds: tuple[tuple[str, ...], ...]
 ) -> Halves:
-    """Return the object pairs with two listed kinds, in either order. An empty list allows all pairs."""
+    """Return the object pairs whose kinds are a listed pair, in either order. An empty list allows all."""
     if not kinds:
         return pairs
     a, b = pairs
@@ -130,7 +130,7 @@ def of_kinds(
 def are_of_kinds(
     bodies: Bodies, ego: Rows, pairs: Halves, kinds: tuple[tuple[str, ...], ...]
 ) -> Bools:
-    """Return a mask of the object pairs with two listed kinds, in either order."""
+    """Return a mask of the object pairs whose kinds are a listed pair, in either order."""
     listed = np.zeros((len(KINDS) + 1, len(KINDS) + 1), np.bool_)  # the last row is the ego
     for one, other in kinds:
         listed[np.ix_(_kind_codes(one), _kind_codes(other))] = True

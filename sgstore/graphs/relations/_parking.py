@@ -121,7 +121,7 @@ class Parking:
 
     @property
     def world_parked(self) -> Codes:
-        """Parking state of each object. States outside the graphs also count."""
+        """Parking state of each object, as :attr:`parked`. Object states outside the graphs also count."""
         return self._parked(1)
 
     def _parked(self, row: int) -> Codes:

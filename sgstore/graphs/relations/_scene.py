@@ -82,7 +82,7 @@ def meeting(group: Ints, low: Floats, high: Floats) -> Iterator[tuple[Rows, Rows
 
 
 def parts(count: Ints) -> Iterator[slice]:
-    """Split an array of counts into slices, each with a sum of about :data:`CHUNK`. Yield the slices."""
+    """Divide an array of counts into slices with sums of about :data:`CHUNK`. Yield the slices."""
     total = np.cumsum(count)
     bounds = np.searchsorted(total, np.arange(CHUNK, int(total[-1]), CHUNK)) if len(total) else []
     for begin, end in zip([0, *bounds], [*bounds, len(count)], strict=True):
@@ -186,7 +186,7 @@ class BodyPairs:
 
     @cached_property
     def span(self) -> Floats:
-        """Distances of the first half of the pairs, (K / 2,). For speed, they may be squares."""
+        """Distances of the first half of the pairs, (K / 2,). For some settings, they are squared (faster)."""
         half = self._half
         found = np.empty(half)
         for part in even_parts(half):
@@ -317,7 +317,7 @@ def distances(bodies: Bodies, a: Rows, b: Rows, between: str) -> Floats:
 
 
 def spans(bodies: Bodies, a: Rows, b: Rows, between: str) -> Floats:
-    """Return numbers with the same order as the distances of object pairs: squares, or gaps of footprints."""
+    """Return numbers that ascend with the distances of object pairs: squares, or gaps of footprints."""
     if between == "footprints":
         boxes = bodies.boxes
         boxes[np.isnan(boxes).any(axis=1), 2:] = 0
@@ -329,7 +329,7 @@ def spans(bodies: Bodies, a: Rows, b: Rows, between: str) -> Floats:
 
 
 def heights_meet(bodies: Bodies, a: Rows, b: Rows) -> Bools:
-    """Return a mask of the object pairs whose height ranges overlap. True if a height is unknown."""
+    """Return a mask of the object pairs with overlapping height ranges. True if a height is unknown."""
     low, high = bodies.low_and_high
     reach = np.fmax(low[b] - high[a], low[a] - high[b])
     solid = high > low
@@ -372,7 +372,7 @@ def levels(bodies: Bodies, between: str) -> Floats:
 
 
 def span_up_to(distance: float, between: str) -> float:
-    """Convert a distance limit to a limit for the result of :func:`spans`, such as its square."""
+    """Convert a distance limit to the scale of :func:`spans`: for example, to the square of the limit."""
     if between == "footprints":
         return distance
     span = distance * distance
@@ -413,7 +413,7 @@ class Standing:
     unsure: NDArray[np.intp]
 
     def take(self, place: NDArray[np.intp]) -> Standing:
-        """Return the map parts below some objects. The row numbers of the objects change."""
+        """Return the map parts below some of the objects. These objects get new row numbers."""
         hits, (rows, nodes) = self.hits, self.parts
         kept, there = place[hits.row] >= 0, place[rows] >= 0
         hits = taken(hits, kept)
@@ -558,7 +558,7 @@ class BlockScene:
 
 
 def always(config: Config) -> bool:
-    """Return True, for a relation that belongs to the graphs under all settings."""
+    """Return True: this is the test for a relation that all settings request."""
     return True
 
 
@@ -621,7 +621,7 @@ def relates_pairs(config: Config) -> bool:
 def edges_between(
     scene: BlockScene, relation: str | Codes, src: NDArray[np.intp], dst: NDArray[np.intp]
 ) -> Edges:
-    """Return edges between objects, given as row numbers. All have one relation, or each has a code."""
+    """Return edges between objects (given as row numbers). Their relation is one for all, or one for each."""
     bodies = scene.bodies
     return Edges(
         bodies.frame[src], _relation_codes(relation, len(src)), bodies.node[src], bodies.node[dst]
@@ -676,7 +676,7 @@ def _relation_codes(relation: str | Codes, count: int) -> Codes:
 
 
 def kinds_mask(names: tuple[str, ...]) -> Bools:
-    """Return an array of truth values indexed by kind code: True for the given kinds."""
+    """Return an array of truth values, indexed by kind code: True for the given kinds."""
     table = np.zeros(MOST_KINDS, np.bool_)
     table[[KIND_CODE[name] for name in names]] = True
     return table
