@@ -492,7 +492,7 @@ RECORDED_OWN: Final[Mapping[str, Type]] = {
 
 
 def own_type(types: Collection[Type]) -> Type:
-    """Return the type of a user-defined attribute whose type differs between traces.
+    """Return the type of a user-defined attribute that has different types in different traces.
 
     A number in one trace makes the attribute a number. Texts in other traces then count as missing values.
     """
@@ -857,7 +857,7 @@ class TopicValue:
 
 @lru_cache(4096)
 def topic_attribute(value: TopicValue, kind: Type) -> Attribute:
-    """Return the frame attribute whose value is a value of a topic."""
+    """Return the frame attribute for a value of a topic."""
     home = {Home.state: "value"}
     return Attribute(value.written, kind, home, "field of a topic", table=value.relation)
 
@@ -1082,7 +1082,7 @@ def attributes_of(catalog: Catalog) -> dict[str, list[Attribute]]:
 def relations_of_set(
     answered: frozenset[str], known: frozenset[str], *, mapped: bool
 ) -> frozenset[str]:
-    """Return the relations that an imported graph set decides: without an edge, they are false.
+    """Return the relations for which a set of edges is complete: a missing edge means false, not unknown.
 
     Parameters
     ----------

@@ -69,7 +69,7 @@ def any_kinds() -> Kinds:
 
 
 def ego_kinds() -> Kinds:
-    """Return the allowed kinds of a variable that must be the ego: any entity kind, if it is the ego."""
+    """Return the kinds allowed for a variable that must be the ego: all kinds of entity."""
     return Kinds(entity_kinds(), frozenset())
 
 
@@ -655,7 +655,7 @@ class Result:
         return [word for word, used in clauses.items() if used]
 
     def having_of_match(self, reason: str) -> Bound | None:
-        """Return the ``HAVING`` condition for a single match. Names of result columns are replaced.
+        """Return the ``HAVING`` condition for a single match, in which expressions replace the column names.
 
         Parameters
         ----------

@@ -144,7 +144,7 @@ def _odd(parts: Sequence[str]) -> str:
 
 
 def _where(part: str, condition: str) -> str:
-    """Return SQL for a value that becomes NULL if a condition on it (``v``) is false.
+    """Return the SQL of a value. It becomes NULL if a condition on the value (written ``v``) is false.
 
     The value is written only once. Otherwise, the text of nested operators would grow exponentially.
     """
