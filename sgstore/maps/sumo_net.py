@@ -338,7 +338,7 @@ def _from_lane(connection: dict[str, str]) -> str:
 
 
 def _lights(net: _SumoNet, lines: dict[str, LaneLine], row_of: dict[str, int]) -> list[PlainSignal]:
-    """Return the traffic lights of a SUMO network. Lanes whose lights always show the same share one light."""
+    """Return the traffic lights of a SUMO network. Lanes share a light if their lights always agree."""
     links: dict[str, dict[tuple[str, ...], dict[int, str]]] = defaultdict(dict)
     for connection in net.connections:
         name, index = connection.get("tl", ""), connection.get("linkIndex", "0")

@@ -185,7 +185,7 @@ class _Links:
             yield from ((self._touched(lane, contact, target, to), to) for to in linked)
 
     def _touched(self, lane: int, contact: str, target: Target, to: int) -> Target:
-        """Return the end of a linked road that touches a lane: the end in the link, or else the other end."""
+        """Return the end of a linked road that a lane touches, even if the link names the wrong end."""
         key = (self._road[lane], contact, target)
         if target.contact not in OTHER:
             return target
@@ -215,7 +215,7 @@ class _Links:
         return math.dist(self._middle[one[1]][one[0]], self._middle[other[1]][other[0]])
 
     def _check(self, named: _Named) -> None:
-        """Warn about linked lanes that are far apart, or whose directions of traffic are opposite."""
+        """Warn about linked lanes that are far apart, or that have opposite directions of traffic."""
         rows = [
             (lane, contact == END, other, at == END)
             for (lane, contact), others in named.items()
@@ -302,7 +302,7 @@ class _Links:
     def _check_sources(
         self, junction: str, incoming: str, ends: list[str], pairs: _LanePairs
     ) -> None:
-        """Warn about lanes that a connection names, but that its incoming road does not have there."""
+        """Warn about lanes that a junction connection names, but its incoming road lacks at that end."""
         sections = dict(self._sections(self._network.roads[incoming]))
         for source, _ in pairs:
             if ends and not any((sections[at], source) in self._network.lane for at in ends):
@@ -358,7 +358,7 @@ class _Links:
                     yield before, after
 
     def _admits(self, before: int, end: str, after: int) -> bool:
-        """Return False if the junction after a lane has connections, but none to the other lane."""
+        """Return False if the junction after a lane has connections, but none from this lane to the other."""
         link = self._road_links[end].get(self._road[before], {})
         if self._inner(before, end) is not None or not link:
             return True

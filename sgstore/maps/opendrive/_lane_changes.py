@@ -42,7 +42,7 @@ _CROSSED: Final = frozenset({"none", "broken", "broken broken", "botts dots"})
 
 
 def permitted(kind: str, attribute: str, owner: int) -> tuple[bool, bool]:
-    """Return two flags: a road mark permits lane changes to higher lane ids, and to lower lane ids.
+    """Return if a road mark permits lane changes to higher lane ids, and if to lower lane ids.
 
     Parameters
     ----------

@@ -366,7 +366,7 @@ def _borders(
 def _of_lanes(
     document: Document, tag: str, lanes: LaneTable, at: tuple[Ints, Floats, Floats]
 ) -> tuple[Floats, Bools]:
-    """Return the cubic polynomial of lane widths or borders at some positions, and a mask of existing ones."""
+    """Return the cubic polynomial of lane widths or borders at some positions, and a mask of known ones."""
     kind = f"road/laneSection/lane/{tag}"
     lane, middle, start = at
     of = lanes.row[document[kind].of]

@@ -337,7 +337,7 @@ _Rings = tuple[list["Floats"], list["Floats"]]
 
 
 def _stand(items: _Items, item: int, rings: _Rings) -> None:
-    """Add the outlines of an object to one of its copies, moved to the position of the copy."""
+    """Add the outlines of a repeated object at the position of one of its copies."""
     s, t, _ = items.place[item]
     items.local.extend(_Ring(item, ring) for ring in rings[0])
     items.along.extend(_Ring(item, ring + np.array((s, t))) for ring in rings[1])
@@ -395,7 +395,7 @@ def _placed(
 
 
 def _laid_out(rings: list[_Ring]) -> tuple[Floats, Ints]:
-    """Concatenate the corners of all outlines. Return them, and the object row of each corner."""
+    """Return the corners of all outlines as one array, and the row of the object for each corner."""
     points = np.concatenate([np.zeros((0, 2)), *(ring.corners for ring in rings)])
     items = np.array([ring.item for ring in rings], np.int64)
     return points, np.repeat(items, np.array([len(ring.corners) for ring in rings], np.int64))

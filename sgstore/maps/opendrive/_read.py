@@ -188,7 +188,7 @@ def _build(document: Document, text: str, name: str, signs: Signs) -> RoadMap:
 
 
 def _at_the_end(shapes: list[Any], number: int) -> NDArray[Any]:
-    """Return an array with one shape per map node. The last nodes get the given shapes, the others ``None``."""
+    """Return an array of one shape per map node: ``None``, and for the last nodes the given shapes."""
     found = np.full(number, None, object)
     found[number - len(shapes) :] = shapes
     return found

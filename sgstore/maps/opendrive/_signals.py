@@ -45,7 +45,7 @@ _READERS: Final = {"asam": "as ASAM OpenDRIVE reads it", "carla": "as CARLA read
 
 @dataclass(slots=True)
 class Doubts:
-    """Check of an OpenDRIVE map for signals whose orientation contradicts the direction of their lanes.
+    """Check for signals of an OpenDRIVE map that are oriented against the direction of their lanes.
 
     Parameters
     ----------

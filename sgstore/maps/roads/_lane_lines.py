@@ -238,7 +238,7 @@ class _Network:
 def plain_lanes(
     lines: Sequence[LaneLine], areas: Sequence[Area] = ()
 ) -> tuple[list[PlainLane], list[str]]:
-    """Convert lane lines to lanes of a road map. Return them, and warnings about guessed values.
+    """Convert lane lines to lanes of a road map. Return the lanes, and warnings about guessed values.
 
     Raises
     ------

@@ -179,7 +179,7 @@ def _text_rows(document: dict[str, Any], what: str, most: int, lanes: int) -> li
 
 
 class _TextRow:
-    """JSON object of a lane or signal, whose fields are checked when they are read."""
+    """JSON object of a lane or signal. Its fields are checked when they are read."""
 
     def __init__(self, fields: dict[str, Any], number: int, lanes: int, what: str) -> None:
         self._fields = fields

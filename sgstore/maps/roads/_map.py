@@ -52,7 +52,7 @@ _MOST_AT_ONCE: Final = 1 << 22
 def _downstream(
     lengths: Floats, src: Ints, dst: Ints, limit: float
 ) -> Iterator[tuple[Ints, Ints, Floats]]:
-    """Yield pairs of lanes and their distance, if the second starts within ``limit`` after the first ends.
+    """Yield pairs of lanes and their distance: the second lane starts within ``limit`` after the first ends.
 
     Traffic flows from ``src`` to ``dst``. The fronts of all lanes advance together, lane by lane.
     """
