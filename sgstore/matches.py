@@ -339,7 +339,7 @@ class Matches(Tabular):
 
     @property
     def mistakes(self) -> tuple[str, ...]:
-        """The subset of :attr:`notes` that a query without matches gets without a second search.
+        """Notes on likely mistakes in the query, if they are found without a second search.
 
         Examples
         --------
@@ -553,7 +553,7 @@ class Matches(Tabular):
     def _in_runs(
         self, frames: Iterable[tuple[Any, ...]], runs: Iterable[tuple[Any, ...]]
     ) -> Iterator[tuple[Any, ...]]:
-        """Yield the rows of frames that lie in one of some rows of intervals or clips."""
+        """Yield the frames, as rows, that lie in one of the given intervals or clips."""
         result = self._ready.query.result
         spans, place = ((run[0], run[1], run[2]) for run in runs), _SEQ_PLACE
         if result.form == "clips":
@@ -602,7 +602,7 @@ class Matches(Tabular):
             return self.parts_each([(frame.trace, frame.seq, next(iter(found), {}))])[0]
 
     def parts_each(self, matches: Sequence[tuple[str, int, Mapping[str, int]]]) -> list[TruthLanes]:
-        """Return the truth lanes of matches, given by trace, frame number and binding; see :meth:`parts`.
+        """For each given match, return the frames in which each part of the pattern is true; see :meth:`parts`.
 
         A part is searched once for all matches with the same variables.
 
@@ -693,7 +693,7 @@ class Matches(Tabular):
 
     @property
     def lists(self) -> Literal["matches", "chosen", "values"]:
-        """Kind of the rows: all matches, some or sorted matches, or values computed from several matches.
+        """Kind of the rows: all matches, some matches (limited or sorted), or computed values.
 
         Examples
         --------
@@ -707,7 +707,7 @@ class Matches(Tabular):
         return "chosen" if chosen or result.form == "intervals" else "matches"
 
     def listed(self) -> Iterator[Interval]:
-        """Yield the match behind each row, in row order, with its binding and its ``RETURN`` values.
+        """Yield the match of each row, in row order, with its binding and its ``RETURN`` values.
 
         A row of a single frame gives an interval of one frame. Nothing is yielded for clips, and if
         :attr:`lists` is ``values``.
@@ -767,7 +767,7 @@ class Matches(Tabular):
             yield from merged((Clip(*row[:3]) for row in rows), self._slack)
 
     def _clips_of(self, frames: Iterable[FrameRef], before: int, after: int) -> Iterator[Clip]:
-        """Yield clips around the runs of frames, as :meth:`clips`; the offsets are in ns."""
+        """Yield clips around series of matching frames, as :meth:`clips`; the offsets are in ns."""
         longest = {one.name: longest_step_ns(one.period_ns) for one in self._ready.catalog.traces}
         clips, last = list[Clip](), None
         for one in sorted(frames, key=_place):
@@ -905,7 +905,7 @@ class Matches(Tabular):
     def _answered(
         self, form: str, offsets: tuple[int, int] = (0, 0), *, whole: bool = False
     ) -> Iterator[tuple[Any, ...]]:
-        """Run the query. Yield its rows as one of: rows, frames, subgraphs, intervals, bound, clips."""
+        """Run the query. Yield results of one form: rows, frames, subgraphs, clips, intervals or ``bound``."""
         with self._compiled() as compiled:
             match form:
                 case "rows":
@@ -961,7 +961,7 @@ class Matches(Tabular):
         *,
         whole: bool = False,
     ) -> Iterator[tuple[SqlStatement, Windows]]:
-        """Yield the SQL statement of each window. The caller adds the row count to ``Windows.rows``."""
+        """Yield the SQL statement of each window of frames. The caller counts rows in ``Windows.rows``."""
         result, form = compiled.query.result, form or compiled.query.result.form
         at_once = form == result.form and not compiled.in_windows
         windows = Windows(
@@ -1070,7 +1070,7 @@ class UnionMatches(Matches):
 
     @property
     def mistakes(self) -> tuple[str, ...]:
-        """Notes of all single queries that need no second search if the query has no matches."""
+        """Notes on likely mistakes in any query of the union, if they are found without a second search."""
         return tuple(dict.fromkeys(note for part in self._parts for note in part.mistakes))
 
     def nearest(self) -> dict[str, Any]:
@@ -1148,7 +1148,7 @@ class UnionMatches(Matches):
                     yield frame
 
     def _rows_of_frames(self, listed: Iterable[Row] | None) -> Iterator[Iterator[tuple[Any, ...]]]:
-        """Yield the rows of frames of each part; only frames in rows of the union, if these are given."""
+        """Yield the frames of each single query as rows; with given rows of the union, only their frames."""
         result = self._results[0]
         rows = None if listed is None or result.aggregated else list(listed)
         if rows and not result.names:
@@ -1178,7 +1178,7 @@ class UnionMatches(Matches):
             yield from merge(*parts, key=lambda of: (natural(of.graph["trace"]), of.graph["seq"]))
 
     def parts(self, frame: FrameRef, binding: Mapping[str, int] | None = None) -> TruthLanes:
-        """Return the truth lanes of the first single query that matches the frame with this binding.
+        """Return the frames in which each part of the first single query with this match is true.
 
         Default: the first part.
         """
@@ -1190,7 +1190,7 @@ class UnionMatches(Matches):
         return next(matching, named[0]).parts(frame, binding)
 
     def parts_each(self, matches: Sequence[tuple[str, int, Mapping[str, int]]]) -> list[TruthLanes]:
-        """Return the truth lanes of each match. Its single query is chosen as in :meth:`parts`."""
+        """For each given match, return the frames in which each part is true; see :meth:`parts`."""
         frames = ((self._file.frame(f"{trace}#{seq}"), given) for trace, seq, given in matches)
         return [self.parts(*one) for one in frames]
 
@@ -1211,7 +1211,7 @@ class UnionMatches(Matches):
         return "matches" if plain else "values"
 
     def listed(self) -> Iterator[Interval]:
-        """Yield the matches of all single queries by trace and start; none if :attr:`lists` is ``values``."""
+        """Yield the matches of all single queries by trace and start; nothing if their rows are values."""
         yield from self.intervals(bound=True) if self.lists == "matches" else ()
 
     def clips(self, before: float = 0.0, after: float = 0.0) -> Iterator[Clip]:
@@ -1288,7 +1288,7 @@ class _LazyRows:
         return next(self._rows)
 
     def take(self, rows: Iterable[Row]) -> int | None:
-        """Take over the rows of another search, unless this search has started. Return their number or None."""
+        """Reuse the rows of another search, unless this search has started. Return their number or None."""
         if self._rows is not None:
             return None
         found = list(rows)
@@ -1428,7 +1428,7 @@ def _with_frames(
 def _rows_within(
     rows: Iterable[tuple[Any, ...]], runs: Iterable[tuple[str, int, int]], place: int
 ) -> Iterator[tuple[Any, ...]]:
-    """Yield the rows of frames whose number or log time, at a place of the row, lies in one of some runs."""
+    """Yield the frame rows whose number or log time is in an interval; ``place`` is the column of the row."""
     spans = defaultdict[str, list[tuple[int, int]]](list)
     for trace, start, end in sorted(runs):
         known = spans[trace]
