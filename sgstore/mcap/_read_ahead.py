@@ -65,7 +65,7 @@ class Buffers:
         self._kept: list[bytearray] = []
 
     def take(self, size: int) -> memoryview:
-        """Return memory of ``size`` bytes, with undefined content. It is in use while a view of it exists."""
+        """Return memory of ``size`` bytes with undefined content. It is reused when no view of it is left."""
         if not size:
             return memoryview(bytearray())
         for buffer in self._kept:

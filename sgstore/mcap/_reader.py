@@ -584,7 +584,7 @@ class McapFile:
         walk.pending = replace(walk.pending, messages=max(walk.pending.messages, 0) + entries)
 
     def _settle(self, walk: _FileWalk) -> None:
-        """Report a lost chunk. Call it after its index records, which contain the number of messages."""
+        """Report a lost chunk. Call this after its index records, because they have the message count."""
         if walk.pending is not None:
             walk.report.lose(walk.pending)
             walk.pending = None
