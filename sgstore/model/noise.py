@@ -177,13 +177,13 @@ class Tracks:
         )
 
     def shifted(self, by: int) -> tuple[Ints, Bools]:
-        """Return the rows ``by`` places later, and a mask: True if that row is in the same part of a track."""
+        """Return the rows ``by`` places later, and a mask of those in the same part of the same track."""
         rows = np.arange(len(self.order)) + by
         there = np.clip(rows, 0, len(rows) - 1)
         return there, (rows == there) & (self.part[there] == self.part) & self.used[there]
 
     def most(self, half: float) -> int:
-        """Return the number of frames on each side of a window, at most."""
+        """Return the largest number of frames on each side of the middle of a time window."""
         return min(MOST_ROWS, round(half / self.period))
 
     def fits(self, values: Floats, half: float, degree: int, turn: float = 0.0) -> Fit:
@@ -277,7 +277,7 @@ class Fit:
         return cls(slope, bend, middle, span, loose)
 
     def instead(self, other: Fit, rows: Bools) -> Fit:
-        """Return these fits. In some rows, use those of another fit instead."""
+        """Return these fitted polynomials, but in some rows those of another fit."""
         return Fit(
             np.where(rows[:, None], other.slope, self.slope),
             np.where(rows[:, None], other.bend, self.bend),
@@ -319,7 +319,7 @@ def _nth(values: Floats, which: Ints) -> Floats:
 
 
 def _close(time: Ints, place: Floats, rows: Ints, jitter: float) -> Bools:
-    """Return a mask of outliers: rows without which the rows before and after fit together."""
+    """Return a mask of outliers: without such a row, the rows before and after it fit together."""
     inside = (rows >= 2) & (rows + 2 < len(time))
     rows = np.clip(rows, 2, max(2, len(time) - 3))
     with np.errstate(all="ignore"):  # Rows of other bodies and times do not count.
@@ -381,7 +381,7 @@ class GapFiller:
     def filled(
         self, values: Floats, found: Floats, fixed: Bools, stands: Bools
     ) -> tuple[Floats, Ints]:
-        """Fill in missing motion of bodies. Return the values, and bits ``derived`` of computed values."""
+        """Fill in missing motion of bodies. Return the values, and bits that mark computed quantities."""
         wanted, derived = values.copy(), np.zeros(len(values), np.int64)
         for bit, (column, first, width) in enumerate(
             ((_VELOCITY, 0, 3), (_ACCELERATION, 3, 3), (_YAW_RATE, 6, 1))
@@ -439,7 +439,7 @@ class Smoother(GapFiller):
     def fill(
         self, node: Ints, frame: Ints, seconds: Floats, values: Floats, fixed: Bools, rows: slice
     ) -> tuple[Floats, Ints, list[Mapping[str, float] | None]]:
-        """Fill in missing motion. Return the values, bits ``derived`` of computed values, and attributes.
+        """Fill in missing motion. Return the values, bits that mark computed quantities, and attributes.
 
         Parameters and result are those of :func:`sgstore.readers._blocks.derive`. The attributes are motion
         from positions, of rows whose motion is recorded.
@@ -490,12 +490,12 @@ PLACE: Final = 3.0
 
 
 def dead_band(noise: float, derived: Ints) -> Floats:
-    """Return half the width of the dead band of positions, (n,); m. 0 for a position that was not smoothed."""
+    """Return half the width of the dead band of each position, (n,); m. 0 for a position without smoothing."""
     return np.where(derived & SMOOTHED > 0, PLACE * noise, 0.0)
 
 
 class DeadBand:
-    """Filter of noisy positions with a dead band: a returned position moves only if the input leaves the band.
+    """Filter of noisy positions with a dead band: a returned position stays until the input leaves the band.
 
     Each returned place is within the band of the position. A lane therefore does not change by noise.
     """
@@ -571,7 +571,7 @@ def noise_of(node: Ints, frame: Ints, seconds: Floats, values: Floats, fixed: Bo
 
 
 def _jitter(tracks: Tracks) -> tuple[float, bool]:
-    """Return the noise from frame to frame (m), and True if positions look interpolated between few points."""
+    """Return the noise between frames (m), and True if positions seem interpolated between few points."""
     place, n = tracks.place[:, :2], len(tracks.place)
     if n < 20:
         return 0.0, False

@@ -114,7 +114,7 @@ class OnlineSmoother(GapFiller):
     def fill(
         self, node: Ints, frame: Ints, seconds: Floats, values: Floats, fixed: Bools, rows: slice
     ) -> tuple[Floats, Ints, list[Mapping[str, float] | None]]:
-        """Fill in missing motion in the next frames. Return the values, bits ``derived``, and attributes.
+        """Fill in missing motion in the next frames. Return values, bits of computed ones, and attributes.
 
         Parameters and result are those of :meth:`sgstore.model.noise.Smoother.fill`.
         """
@@ -168,7 +168,7 @@ class OnlineSmoother(GapFiller):
         return motion
 
     def _white(self, step: float) -> tuple[float, float]:
-        """Return the variance of white noise with the same effect, and the time constant of the weights; s."""
+        """Return the variance of white noise that has the same effect, and the decay time of the weights; s."""
         jitter, wander = self.noise
         slow = max(0.0, wander**2 - jitter**2) * max(1.0, HALF / step)
         variance = jitter**2 + slow
@@ -238,7 +238,7 @@ def _predicted(bodies: _Followed, step: Floats) -> tuple[Floats, Floats]:
 
 
 def _faded(bodies: _Followed, moved: Floats, step: Floats, calm: float) -> tuple[Floats, Floats]:
-    """Reduce the weight of old positions after a time step. Return their sums relative to the new position."""
+    """Reduce the weights of old positions after a time step. Return sums relative to the new position."""
     s0, s1, s2 = bodies.sums.T
     m0, m1 = bodies.moments[:, 0], bodies.moments[:, 1]
     fade = np.exp(-step / calm)

@@ -83,7 +83,7 @@ class NotesFile:
         return found.st_size, found.st_mtime_ns
 
     def add(self, note: Note, last: int, *, gone: bool = False) -> None:
-        """For each frame from that of ``note`` to ``last``, append the tag (or its removal) to the file.
+        """Append the tag (or its removal) to the file, one row per frame from the note's frame to ``last``.
 
         Raises
         ------

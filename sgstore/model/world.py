@@ -327,7 +327,7 @@ class Life(NamedTuple, Generic[AnyEntity]):
     seen: Sight | None = None
 
     def goes_on(self, kind: int | None, here: Sight) -> bool:
-        """Return True if an observation can belong to this object: same kind, and possible distance.
+        """Return True if an observation can belong to this object: the same kind, at a possible distance.
 
         The kinds must be equal (``None``: uncertain kind), and the distance must be possible. After a clock
         jump, any distance is possible.

@@ -471,7 +471,7 @@ class Config:
         ]
 
     def unknown_of(self, types: Mapping[str, int]) -> dict[str, int]:
-        """Return how often each type name occurs for which the settings define no kind.
+        """Return the type names for which the settings define no kind, each with its number of occurrences.
 
         Examples
         --------
@@ -483,7 +483,7 @@ class Config:
         return {name: n for name, n in types.items() if name.lower() not in self.types}
 
     def as_stored(self) -> dict[str, Any]:
-        """Return the settings as a store keeps them. Settings added later are left out at their default.
+        """Return the settings as a store keeps them. Settings of newer versions are omitted at their default.
 
         Examples
         --------

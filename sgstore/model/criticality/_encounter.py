@@ -106,7 +106,7 @@ class Encounter:
                 yield self._touching(first + blocks_a[part], blocks_b[part])
 
     def _touching(self, blocks_a: Ints, blocks_b: Ints) -> tuple[Ints, Ints]:
-        """Return the frame rows of a and b, within pairs of frame groups, whose footprints touch or overlap."""
+        """Within pairs of frame groups, return the frame rows of a and b in which their footprints touch."""
         inner = np.arange(_BLOCK)
         rows_a = (blocks_a[:, None] * _BLOCK + inner)[:, :, None]
         rows_b = (blocks_b[:, None] * _BLOCK + inner)[:, None, :]

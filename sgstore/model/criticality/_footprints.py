@@ -227,7 +227,7 @@ class AreaSearch:
         return ((self._inner[a] + self._inner[b]) * (1 - 1e-9)) ** 2
 
     def _new(self, pair: Ints, first: tuple[Ints, Ints], last: tuple[Ints, Ints]) -> Bools:
-        """Return a mask of row ranges that may contain an earlier first or a later last row of their pair."""
+        """Return a mask of row ranges that may contain an earlier first meeting or a later last one."""
         new = np.zeros(len(pair), np.bool_)
         for one in (0, 1):
             new |= (first[one] < self.first[one, pair]) | (last[one] > self.last[one, pair])

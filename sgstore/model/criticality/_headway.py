@@ -85,7 +85,7 @@ class HeadwaySearch(AreaSearch):
         np.minimum.at(self.least, pair[near[on]], headway[on])
 
     def _headways(self, a: Ints, b: Ints) -> Floats:
-        """Return the time from b's last frame at a position until a is there; s. Infinite if never."""
+        """Return the time from b's last frame at a position until a reaches it; s. Infinite if a never does."""
         key = self._object[b] * len(self._times) + self._end[a]
         last = np.minimum(self._keys.searchsorted(key, "right") - 1, self._ends[b])
         last = np.where(last >= 0, self._last_both[last], -1)

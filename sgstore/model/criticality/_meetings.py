@@ -36,7 +36,7 @@ _DENSE: Final = 1 << 16
 
 
 def _numbered(ids: Ints) -> tuple[Ints, Ints]:
-    """Return ascending ids, which include all given ones, and the index of each given id in them."""
+    """Return ascending ids that include the given ones, and the index of each given id in this list."""
     low = int(ids.min())
     if int(ids.max()) - low < _DENSE:
         return np.arange(low, int(ids.max()) + 1), ids - low
@@ -164,7 +164,7 @@ class Meetings:
 
     @cached_property
     def ahead(self) -> Ints:
-        """Return the rows in which object b may be ahead in the path of object a: all such rows, and more."""
+        """Return all rows in which object b may be ahead in the path of object a, with some rows too many."""
         x, y, _, heading, length, width, *_ = self._states.T
         cosine, sine = np.cos(heading), np.sin(heading)
         dx, dy = x[self.b] - x[self.a], y[self.b] - y[self.a]
@@ -188,7 +188,7 @@ class Meetings:
 
     @cached_property
     def exposed(self) -> tuple[Ints, Ints, Floats, Floats]:
-        """Rows of pairs with a short TTC, first row of each pair, TTC (s), and time step (s)."""
+        """Return the rows with a short TTC of each pair: pair, first row, TTC (s) and time step (s)."""
         vx, vy = self._states[:, 6], self._states[:, 7]
         speed = np.hypot(vx[self.b] - vx[self.a], vy[self.b] - vy[self.a])
         near = np.flatnonzero(self.known & (self.beyond - TAU * speed <= _MARGIN))
@@ -205,7 +205,7 @@ class Meetings:
 
     @cached_property
     def _near(self) -> tuple[Ints, Ints]:
-        """Pairs of objects whose areas of movement overlap, and the state rows of these objects."""
+        """Pairs of objects that move in overlapping areas, and the state rows of these objects."""
         others, sources = self._objects
         code, when, place, _ = self._tracks
         reach = np.hypot(self._states[:, 4], self._states[:, 5]) / 2 + _MARGIN
@@ -223,7 +223,7 @@ class Meetings:
 
     @cached_property
     def _footprints(self) -> tuple[Footprints, Ints, Ints]:
-        """Footprints of objects whose areas of movement overlap, and the two objects of each pair."""
+        """Footprints of the objects that move in overlapping areas, and the two objects of each pair."""
         pairs, rows = self._near
         code, _, place, _ = self._tracks
         boxes = [self._states[:, column][place[rows]] for column in FOOTPRINT]

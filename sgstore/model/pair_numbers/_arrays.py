@@ -107,7 +107,7 @@ _AS_PYTHON: Final = tuple(
 
 
 def _case(*parts: Any) -> Any:
-    """Evaluate an SQL ``CASE`` on arrays: first value with a true condition, else the last value, or NaN."""
+    """Evaluate an SQL ``CASE`` on arrays: first value with a true condition, or the last value, or NaN."""
     pairs, found = len(parts) // 2, parts[-1] if len(parts) % 2 else np.nan
     for i in reversed(range(pairs)):
         found = np.where(parts[2 * i], parts[2 * i + 1], found)
