@@ -93,7 +93,7 @@ _VEHICLE: Final = np.array([KIND_CODE[kind] for kind in kinds_labelled("Vehicle"
 
 
 class Contradiction(NamedTuple):
-    """Finding about one kind of contradiction: first body and frame, all bodies, row count, description."""
+    """Contradiction of one kind: the first body and frame, all bodies, the row count and a description."""
 
     kind: str
     node: int
@@ -115,7 +115,7 @@ class Vote:
 
 @dataclass(frozen=True, slots=True)
 class BodyRows:
-    """States of bodies, sorted by node and frame: those of a block, after the last ones of earlier blocks.
+    """States of bodies in a block, and their last states in earlier blocks; sorted by node and frame.
 
     Attributes
     ----------
@@ -203,13 +203,13 @@ class Steps:
 
 @dataclass(slots=True)
 class Tally:
-    """Votes for the causes of contradictions, and numbers of compared steps, by quantity and body."""
+    """Votes for the causes of contradictions, and counts of compared pairs of states, by quantity and body."""
 
     votes: dict[tuple[str, int], Vote] = field(default_factory=dict[tuple[str, int], Vote])
     compared: dict[str, Ints] = field(default_factory=dict[str, "Ints"])
 
     def total(self, quantity: str, node: int | None = None) -> int:
-        """Return how many steps of a body (or of all bodies) were compared."""
+        """Return how many pairs of successive states were compared, for one body or for all."""
         counts = self.compared.get(quantity, np.zeros(0, np.int64))
         return int((counts if node is None else counts[node : node + 1]).sum())
 
@@ -222,7 +222,7 @@ class Tally:
         values: tuple[Floats, Floats],
         *causes: Floats,
     ) -> None:
-        """Count compared steps and contradicting steps. Each contradicting step votes for its possible causes.
+        """Count compared and contradicting pairs of states. Contradicting ones vote for their possible causes.
 
         ``values`` has a row per step, and a cause per contradicting step.
         """
@@ -250,7 +250,7 @@ class Tally:
 
 
 def factor_of(cause: float) -> float:
-    """Convert the number of a histogram bin of votes to the factor that it represents."""
+    """Convert the number of a histogram bin back to a factor, such as 3.6."""
     return float(np.exp(cause / _BINS))
 
 
@@ -378,7 +378,7 @@ def _rates(
 
 
 def judged(tally: Tally) -> Iterator[Contradiction]:
-    """Yield the contradictions with enough agreeing votes, for single bodies or for all together."""
+    """Yield the contradictions for which enough votes agree: for single bodies, or for all together."""
     quantities: dict[str, dict[int, Vote]] = {}
     for (quantity, node), vote in tally.votes.items():
         quantities.setdefault(quantity, {})[node] = vote
@@ -426,7 +426,7 @@ def _agreed(
 
 
 def _alike(cause: int) -> tuple[int, ...]:
-    """Return the bin (histogram cell) of a factor or an angle, and its two neighbours."""
+    """Return the histogram bin of a factor or angle, and the two bins next to it."""
     base = (cause + 500) // 1_000 * 1_000
     if not base:
         return cause - 1, cause, cause + 1

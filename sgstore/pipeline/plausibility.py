@@ -283,7 +283,7 @@ class Plausibility:
             self._see_lights(rows)
 
     def watched(self, frames: Iterable[Frame]) -> Iterator[Frame]:
-        """Yield the frames of a client (monitor or running simulator) unchanged, and check them.
+        """Yield the frames of a client (monitor or running simulator) as they are, and check them.
 
         Examples
         --------
@@ -407,7 +407,7 @@ class Plausibility:
         event.nodes.add(node)
 
     def _happen_each(self, kind: str, block: FrameBlock, rows: Bools, value: str) -> None:
-        """Count cases of implausible data: one for each row in a mask. ``value``: text with ``{column}``."""
+        """Count each row in a mask as a fault. ``value``: message, with numbers of the first row inserted."""
         at = np.flatnonzero(rows)
         states, first = block.states, int(at[0])
         shown = {name: float(getattr(states, name)[first]) for name in _SHOWN}
@@ -459,7 +459,7 @@ class Plausibility:
             self._moves.append(_Move(node, frame, complex(*start), complex(*end)))
 
     def _see_returned(self, rows: BodyRows, before: int) -> None:
-        """Find new bodies whose id another body used until the frame before."""
+        """Find new bodies with an id that another body had until the frame before."""
         if not self._nodes:
             self._nodes = {ident: node for node, ident in enumerate(self._idents[:before])}
         for node in range(before, len(self._idents)):
@@ -513,7 +513,7 @@ class Plausibility:
                 self._grown.setdefault(node, (frame, value))
 
     def _judge_moves(self) -> None:
-        """Count jumps of bodies as implausible. Two bodies that swap places in a frame have swapped ids."""
+        """Count jumps as faults: ``swapped ids`` if two objects exchange places, else ``teleport``."""
         frames: dict[int, list[_Move]] = {}
         step = _USUAL * float(np.median(np.diff(self._times))) / 1e9 if self._moves else 0.0
         for move in self._moves:
@@ -589,7 +589,7 @@ class Plausibility:
         self._shares["vehicles"] += int(vehicle.sum())
 
     def _judge(self) -> None:
-        """Remove kinds of implausible data with too few cases. Add changing sizes and impossible heights."""
+        """Drop kinds of findings with too few cases. Add findings of changing sizes and impossible heights."""
         events, shares = self._events, self._shares
         rare = {
             kind
@@ -660,7 +660,7 @@ class Plausibility:
             )
 
     def _judge_places(self, road_map: RoadMap) -> None:
-        """Compare a sample of ego positions with the lanes. Without an ego, use those of all vehicles."""
+        """Compare a sample of ego positions with the lanes. Without an ego, use positions of all vehicles."""
         places = np.concatenate(self._places)
         places = places[places[:, 3] > 0]
         own = places[places[:, 2] > 0] if places[:, 2].any() else places
@@ -705,7 +705,7 @@ class Plausibility:
     # Traffic lights.
 
     def _see_lights(self, rows: BodyRows) -> None:
-        """Check the lights: possible order of states, flicker. Store which lights need lanes in the map."""
+        """Check the lights: order of states, and flicker. Remember which lights need lanes in the map."""
         shown = rows.values[:, LIGHT].astype(np.int64)
         lit = rows.fresh & (shown >= 0)
         # A light that is always off needs no lanes.

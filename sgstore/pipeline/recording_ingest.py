@@ -426,7 +426,7 @@ class SegmentReader:
 
     @cached_property
     def _request(self) -> str:
-        """Return all inputs that determine a trace, as JSON. Empty if other files also determine it.
+        """Return all inputs that determine a trace, as JSON. Empty if other files also affect the trace.
 
         A list of egos gives several traces. A folder of maps and a file of a mapping can change.
         """

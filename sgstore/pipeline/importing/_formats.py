@@ -407,7 +407,7 @@ def _whole(path: Path, line: int, lines: Iterator[str]) -> Iterator[tuple[str, A
 
 
 def _values(text: str) -> int:
-    """Return an estimate, never too small, of the number of values in a JSON text, without parsing it."""
+    """Return an upper bound for the number of values in a JSON text, without parsing the text."""
     return sum(map(text.count, "[{,"))
 
 

@@ -78,7 +78,7 @@ def read_openlabel(path: Path) -> Iterator[GivenGraph]:
 
 
 def metadata_of(path: Path) -> dict[str, Any]:
-    """Return the metadata of an OpenLABEL file, unchanged."""
+    """Return the metadata of an OpenLABEL file."""
     return _Labels(path).root.get("metadata") or {}
 
 
@@ -342,7 +342,7 @@ class _Labels:
         return [float(one) for one in value]
 
     def _time(self, about: Mapping[str, Any], where: str) -> int | None:
-        """Return the time of a frame; ns. If the file has no time for it, ``None``.
+        """Return the time of a frame; ns. ``None`` if the file has no time for the frame.
 
         The unit of a number (s, ms, µs or ns since 1970) follows from its size. Seconds may have
         another origin.

@@ -205,7 +205,7 @@ OWN: Final = "own"
 
 @dataclass(frozen=True, slots=True)
 class LabelMeaning:
-    """Meaning of a node label in an imported file: a node kind of sgstore, and details.
+    """Meaning of a node label in an imported file: kind, subkind and other properties of the node.
 
     Attributes
     ----------
@@ -372,7 +372,7 @@ def _kind(text: str) -> str:
 
 
 def _simulators(text: str) -> LabelMeaning | None:
-    """Return the kind and details for a simulator's type name, such as ``vehicle.audi.tt``.
+    """Return kind and other properties for a simulator's type name, such as ``vehicle.audi.tt``.
 
     The longest known part before a dot counts. ``None`` means unknown.
     """
