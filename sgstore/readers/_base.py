@@ -143,7 +143,7 @@ BEGINNING: Final = 1_000_000_000
 
 
 def count_ref(told: dict[Key, tuple[int, Ref]], key: Key, ref: Ref, times: int = 1) -> int:
-    """Count an item with a given key, and store the position of the first one. Return the count before."""
+    """Count an item with a given key, and store the position of the key's first item. Return the old count."""
     before, first = told.get(key, (0, ref))
     told[key] = before + times, first
     return before
@@ -239,7 +239,7 @@ class Survey(Generic[AnyLead]):
         return met
 
     def keeps(self, channel: int) -> bool:
-        """Return True if messages of a channel are needed in the second reading, which makes the frames."""
+        """Return True if messages of a channel are needed in the second reading, in which frames are made."""
         raise NotImplementedError
 
     def look(self, run: Messages, row: int) -> None:
@@ -326,7 +326,7 @@ class Survey(Generic[AnyLead]):
         return record.topic, record.message_encoding, *named
 
     def shared_stamps(self, channel: int, stamps: Stamps) -> Stamps:
-        """Return the time stamps of a known channel with the same topic and schema; otherwise ``stamps``."""
+        """Return the time stamps of the known channel with the same topic and schema; else ``stamps``."""
         leads = self.leads
         return next((leads[one].stamps for one in self.alike(channel) if one in leads), stamps)
 
@@ -336,7 +336,7 @@ class Survey(Generic[AnyLead]):
         return lost[0].reason if lost else "no list of objects can be read"
 
     def ego_named(self, name: str) -> str | None:
-        """Return the id of the ego with a name; ``None`` if only another reading of the recording finds it.
+        """Return the id of the ego with a name; ``None`` if the recording must be read again to find the ego.
 
         Raises
         ------
@@ -372,7 +372,7 @@ class Survey(Generic[AnyLead]):
         report.losses += self.lost.losses()
 
     def once(self, first_ns: int) -> list[Ref]:
-        """Return each message that is the only one of its channel, if it is near the first frame.
+        """Return the messages of channels with a single message, if they are near the first frame.
 
         Such a message, for example a camera calibration, is valid for the whole recording.
         """
@@ -461,7 +461,7 @@ class MessageTrace:
         self.recording.close()
 
     def ego_named(self, name: str) -> str | None:
-        """Return the id of the ego vehicle with a name; ``None`` if the recording must be opened again.
+        """Return the id of the ego vehicle with a name; ``None`` if the recording must be read again.
 
         Raises
         ------
@@ -515,7 +515,7 @@ class MessageTrace:
         return steps, first_noise(decoder, [*frames, *islice(raw, ESTIMATED - len(frames))])
 
     def _surveyed_steps(self) -> list[int]:
-        """Return the time steps between the first frames, if the first reading has found them; ns."""
+        """Return the time steps between the first frames, if they are known after the first reading; ns."""
         return []
 
     def _raw(self, decoder: MessageDecoder[Any]) -> Iterator[Any]:
@@ -707,7 +707,7 @@ class FramesTrace(MessageTrace):
         )
 
     def ego_named(self, name: str) -> str:
-        """Return the name of the ego unchanged. Such frames have no names other than ids."""
+        """Return the given name as the id of the ego: such frames have no other names."""
         return name
 
     @staticmethod

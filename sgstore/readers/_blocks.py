@@ -264,7 +264,7 @@ class EntityTable:
         return before + len(self._returned) - 1
 
     def turn(self, number: int, lifetime: int, seq: int) -> None:
-        """Record that an id belongs to another object from a frame on, given by its lifetime number."""
+        """Record from which frame on an id belongs to another object, and that object's lifetime number."""
         self._turns.setdefault(self._rows[number].ident, []).append((seq, lifetime))
 
     @property
@@ -545,7 +545,7 @@ def assemble(
 
 
 class _BlockMaker(Generic[Raw]):
-    """Builder of blocks. It keeps frames until all later frames are known that they depend on.
+    """Builder of blocks (frames converted together). It keeps a frame until all later frames it needs exist.
 
     Parameters
     ----------
@@ -579,11 +579,11 @@ class _BlockMaker(Generic[Raw]):
 
     @property
     def starts_block(self) -> bool:
-        """True if the next frame begins another block."""
+        """True if the next frame begins another block (frames that are converted together)."""
         return self._count > 0 and self._count % self._size == 0
 
     def start_block(self, before: list[MessageRefs], same: list[MessageRefs], known: int) -> None:
-        """End the current block before the next frame. ``known``: number of entities until then."""
+        """Begin a block (frames converted together) at the next frame. ``known``: entities before it."""
         self._borders.append((self._refs + before, known))
         self._refs = same
 
@@ -599,7 +599,7 @@ class _BlockMaker(Generic[Raw]):
         return self._count - self._first
 
     def ready(self, known: int) -> Iterator[FrameBlock]:
-        """Yield the next block as soon as the later frames are known that it depends on.
+        """Yield the next block as soon as all later frames that it needs are known.
 
         ``known``: number of entities of the frames so far.
         """
@@ -641,7 +641,7 @@ class _BlockMaker(Generic[Raw]):
 
 @dataclass(slots=True)
 class _Between:
-    """Buffer for positions of messages between two frames. A full buffer keeps the first and last ones.
+    """Buffer for message positions between two frames. If it is full, only the first and last ones stay.
 
     A recording may contain hours of pictures without ground truth. Messages far from every frame are not
     needed.
@@ -662,7 +662,7 @@ class _Between:
             self._total = 2 * NEAR_REFS
 
     def split(self, log_time_ns: int) -> tuple[list[MessageRefs], list[MessageRefs]]:
-        """Empty the buffer. Return message positions with other log times, and those with the given one."""
+        """Empty the buffer. Return its positions in two lists: with other log times, and with the given one."""
         if not self._total:
             return self.take(), []
         whole = chained(self.take())
@@ -703,7 +703,7 @@ def _block(
     known: int,
     smoother: Smoother | OnlineSmoother | None,
 ) -> FrameBlock:
-    """Build a block of frames from its frames and the frames before and after it.
+    """Convert some frames to a block. The frames before and after them are needed to compute motion.
 
     ``part``: number of frames before the block, and of frames in it; ``known``: number of entities before
     the first frame of the next block.
@@ -1126,7 +1126,7 @@ def _possible(values: Floats, rows: slice, steps: Steps) -> tuple[Steps, Bools]:
 
 
 def _slope(values: Floats, rows: slice, steps: Steps, turn: float = 0.0) -> Floats:
-    """Return how fast values change at each row, from the rows before and after it, as far as available.
+    """Return the rate of change of values at each row, from the rows before and after that are available.
 
     ``turn``: period of the values, for example 2π; differences are then the smallest possible.
     """

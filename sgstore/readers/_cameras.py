@@ -76,7 +76,7 @@ class RecordedCameras:
             yield block
 
     def at(self, seq: int, topic: str) -> Media | None:
-        """Return the picture of a camera whose log time is nearest to that of a frame, as a store would.
+        """Return the camera picture nearest to a frame by log time, chosen as in a store.
 
         Raises
         ------

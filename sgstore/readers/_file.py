@@ -170,11 +170,11 @@ class NumberedFile(MessageFile):
             self.counts[number] = steps if number == 2 else 1
 
     def message(self, number: int) -> bytes:
-        """Return the bytes of the message with a number. An unknown number raises an ``IndexError``."""
+        """Return the bytes of a message, given its number. An unknown number raises an ``IndexError``."""
         raise NotImplementedError
 
     def time_of(self, number: int) -> int:
-        """Return the time of the step with a number, from 1; ns."""
+        """Return the time of a time step, given its number (from 1); ns."""
         raise NotImplementedError
 
     def _walk(self, report: Findings, wanted: Callable[[int], bool]) -> Iterator[Messages]:
@@ -223,7 +223,7 @@ def read_numbered(
 def grouped(
     messages: Iterable[tuple[int, int, bytes]],
 ) -> Iterator[tuple[dict[int, bytes], list[int]]]:
-    """Yield messages (offset, time, bytes) in groups: mapping offset → bytes, and list of times."""
+    """Yield messages in groups. A group has a mapping from offset to bytes, and a list of times."""
     held: dict[int, bytes] = {}
     times: list[int] = []
     size = 0

@@ -380,7 +380,7 @@ _Row = tuple[int, int, int, "Callable[[], bytes]"]
 
 
 def _rows(path: Path, base: int, channel: int, chunk: int) -> list[_Row]:
-    """Return time and position of the video messages in a chunk, or outside chunks for -1.
+    """Return time and position of the video messages in a chunk of the file; -1 means outside all chunks.
 
     ``base`` is the position of the file in its bag.
     """
@@ -431,7 +431,7 @@ def _copied(messages: Messages, row: int) -> bytes:
 
 
 def _parts(path: Path, channel: int) -> Iterator[tuple[Path, int, int]]:
-    """Yield each file of a recording, its byte position, and the channel's id in it."""
+    """Yield each file of a recording with its start in the recording, and the channel's id in this file."""
     folder = bag_folder(path)
     if folder is None:
         yield path, 0, channel

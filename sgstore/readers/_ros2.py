@@ -506,7 +506,7 @@ class MessageReader:
         return [self.value(element) for _ in range(count)]
 
     def spend(self, values: int) -> None:
-        """Count values of a message that are decoded. Raise an error if there are too many."""
+        """Count the decoded values of a message. Raise an error if there are too many."""
         self.left -= values
         if self.left < 0:
             raise TraceError(f"a message of more than {MAX_VALUES} values")
@@ -519,7 +519,7 @@ def dtype_of(order: str, code: str) -> np.dtype[Any]:
 
 @dataclass(slots=True)
 class _StructLayout:
-    """Byte positions of the numbers in one element of a ROS sequence.
+    """Byte positions of the numbers in one element of a sequence in a ROS message.
 
     ``size``: bytes from its start to the next element; ``prefixes``: position and value of each length in it;
     ``runs``: first column, position, number and type of adjacent numbers.
@@ -530,7 +530,7 @@ class _StructLayout:
     runs: list[tuple[int, int, int, np.dtype[Any]]]
 
     def agreeing(self, values: memoryview, order: str, place: int, most: int) -> int:
-        """Return how many of the next elements of the sequence have their numbers at these positions."""
+        """Return how many of the next sequence elements have their numbers at these positions."""
         for offset, expected in self.prefixes:
             if most < 1:
                 break

@@ -209,7 +209,7 @@ class AutowareSurvey(Survey[ObjectLead]):
         return self._content(channel) in {OBJECTS, POSE_OF_EGO, TRANSFORMS}
 
     def keeps(self, channel: int) -> bool:
-        """Return True if messages of a channel are needed in the second reading, which makes the frames."""
+        """Return True if messages of a channel are needed in the second reading, in which frames are made."""
         return bool(self._content(channel))
 
     def _content(self, channel: int) -> str:

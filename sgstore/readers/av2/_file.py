@@ -95,14 +95,14 @@ class Av2File(NumberedFile):
         self.losses += lost
 
     def message(self, number: int) -> bytes:
-        """Return the bytes of the message with a number: 0 is the map, the others are sweeps."""
+        """Return the bytes of a message, given its number: 0 is the map, the others are annotated frames."""
         if number == 0:
             return self._map
         rows = self._steps[number - 1].tolist()
         return self._boxes.message(self.time_of(number), self._ego or EGO, rows)
 
     def time_of(self, number: int) -> int:
-        """Return the time of the sweep with a number, from 1; ns."""
+        """Return the time of a frame, given its number (from 1); ns."""
         return int(self._times[self._steps[number - 1][0]])
 
 

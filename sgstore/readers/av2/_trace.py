@@ -22,5 +22,5 @@ class Av2Trace(BoxesTrace):
 
     @staticmethod
     def role(channel: Channel) -> str:
-        """Return the role of a channel: ``ground_truth`` for sweeps, ``map``, or otherwise ``payload``."""
+        """Return the role of a channel: ``ground_truth`` for annotated frames, ``map``, or else ``payload``."""
         return {FRAME: "ground_truth", MAP: "map"}.get(channel.schema, "payload")

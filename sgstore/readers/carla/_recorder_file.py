@@ -170,7 +170,7 @@ class _LoggedActor(NamedTuple):
 
 @dataclass(slots=True)
 class _LoggedWorld:
-    """Actors at one time of a log and their boxes, and the ids with a description in earlier packets.
+    """Actors and their bounding boxes at one time of a log, and the ids of actors described so far.
 
     ``others``: ids of sensors and the spectator; ``unknown``: ids without a description.
     """

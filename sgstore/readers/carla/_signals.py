@@ -102,7 +102,7 @@ class Light:
 def signals_of(
     lights: Mapping[int, Light], road_map: RoadMap, told: Mapping[int, str] | None = None
 ) -> dict[int, str]:
-    """Return the map signal of each traffic light by id. Without a signal: the names of its lanes.
+    """Return the map signal of each traffic light by id; or for a light without signal, the names of its lanes.
 
     Parameters
     ----------
@@ -292,7 +292,7 @@ def _nearest_in_turn(near: _Near, rows: Rows) -> dict[int, int]:
 
 
 def least_sum(cost: Floats) -> Rows:
-    """Assign a different column to each row of a cost matrix. The total cost is the least possible.
+    """Assign a different column to each row of a cost matrix, so that the total cost is as low as possible.
 
     Parameters
     ----------
@@ -344,7 +344,7 @@ def least_sum(cost: Floats) -> Rows:
 def _by_boxes(
     lights: Mapping[int, Light], road_map: RoadMap, columns: Iterable[int]
 ) -> dict[int, str]:
-    """Assign unused map signals to traffic lights whose trigger boxes lie on the lanes of the signal.
+    """Assign unused map signals to traffic lights with trigger boxes on the lanes of the signal.
 
     Of several signals, the one with the most of these lanes is used, then the nearest. Without a free signal,
     the lanes of the boxes are returned by name.

@@ -373,7 +373,7 @@ class CarlaSurvey(Survey[Lead]):
         }
 
     def ego_named(self, name: str) -> str | None:
-        """Return the id of the ego with a name; ``None`` if only another reading of the recording finds it."""
+        """Return the id of the ego with a name; ``None`` if only another reading can find the ego."""
         egos = self.egos
         if name.isdecimal() and int(name) not in egos.actors.keys() | egos.seen:
             return None
@@ -406,7 +406,7 @@ class CarlaSurvey(Survey[Lead]):
         return met or (content == ODOMETRY and self._is_lost(channel))
 
     def keeps(self, channel: int) -> bool:
-        """Return True if messages of a channel are needed in the second reading, which makes the frames."""
+        """Return True if messages of a channel are needed in the second reading, in which frames are made."""
         return self._content(channel) in FOR_FRAMES
 
     def _content(self, channel: int) -> str:
@@ -469,7 +469,7 @@ class CarlaSurvey(Survey[Lead]):
 
     @property
     def _take(self) -> dict[str, Callable[[dict[str, Any]], bool]]:
-        """Functions that collect information from messages, by content type. They return True if it is new."""
+        """Functions that collect information from messages, by content type. True means new information."""
         return {
             ACTORS: self._take_actors,
             LIGHT_PLACES: self._take_lights,

@@ -93,7 +93,7 @@ class CommonRoadFile(NumberedFile):
             self.losses.append(f"{self._scenario.more_lost} more of the same kinds")
 
     def message(self, number: int) -> bytes:
-        """Return the bytes of the message with a number: 0 is the map, the others are time steps.
+        """Return the bytes of a message, given its number: 0 is the map, the others are time steps.
 
         Raises
         ------
@@ -106,7 +106,7 @@ class CommonRoadFile(NumberedFile):
         return _step_message(self._scenario, self._steps[number - 1], standing)
 
     def time_of(self, number: int) -> int:
-        """Return the time of the step with a number, from 1; ns."""
+        """Return the time of a time step, given its number (from 1); ns."""
         return round(self._steps[number - 1] * self._scenario.step * 1e9)
 
 

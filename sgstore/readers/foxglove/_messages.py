@@ -76,7 +76,7 @@ class Axes:
     _tracks: dict[str, _Track] = field(default_factory=dict[str, _Track])
 
     def tell(self, child: str, parent: str, time_ns: int, pose: Pose) -> bool:
-        """Add the pose of coordinate axes relative to their parent. Return False if it is not accepted."""
+        """Add the pose of coordinate axes relative to their parent. Return False if the pose is rejected."""
         track = self._tracks.get(child)
         if track is None:
             if len(self._tracks) >= MAX_AXES or child == parent:
@@ -362,7 +362,7 @@ class ChannelReader:
 
 
 def _get(part: Any, name: str, otherwise: Any) -> Any:
-    """Return a field of a protobuf message or JSON object, or ``default`` if it is missing."""
+    """Return a field of a protobuf message or JSON object, or ``default`` if the field is missing."""
     if isinstance(part, dict):
         return part.get(name, otherwise)
     if part is None:

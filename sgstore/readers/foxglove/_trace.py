@@ -160,7 +160,7 @@ class FoxgloveSurvey(Survey[Lead]):
         return [*self.once(first), *(ref for count, ref in lasting.values() if count == 1)]
 
     def keeps(self, channel: int) -> bool:
-        """Return True if messages of a channel are needed in the second reading, which makes the frames."""
+        """Return True if messages of a channel are needed in the second reading, in which frames are made."""
         return bool(encoding_of(self.recording, channel))
 
     def meet(self, channel: int) -> bool:

@@ -442,7 +442,7 @@ def _lose(report: Findings, loss: Loss) -> None:
 
 
 def _beginning(data: bytes) -> bytes:
-    """Return the first bytes, which are equal in all messages of an OSI file; empty without OSI version."""
+    """Return the first bytes of a message that are equal in all messages; empty without OSI version."""
     try:
         number, wire, _start, stop = next(fields_of(data, 0, len(data)))
     except (ValueError, StopIteration):

@@ -82,7 +82,7 @@ def hosts_of(message: Any) -> list[int]:
 
 
 def keys_of(objects: list[bytes], last: list[bytes]) -> list[bytes]:
-    """Return the first bytes of each serialised OSI object, up to the end of its id.
+    """For each serialised OSI object, return its first bytes, which contain its id.
 
     If the objects match ``last``, an earlier result of this function, the same list is returned.
     """
@@ -95,7 +95,7 @@ def keys_of(objects: list[bytes], last: list[bytes]) -> list[bytes]:
 
 
 def is_key(key: bytes, thing: Any) -> bool:
-    """Return True if the given first bytes of a serialised OSI object are its id, and nothing else."""
+    """Return True if the first bytes of a serialised OSI object contain only its id."""
     ident = thing.id.SerializeToString()
     return len(ident) < 0x80 and key == b"\x0a" + bytes([len(ident)]) + ident
 
@@ -382,7 +382,7 @@ class OsiSurvey(Survey[OsiLead]):
         return refs
 
     def keeps(self, channel: int) -> bool:
-        """Return True if messages of a channel are needed in the second reading, which makes the frames."""
+        """Return True if messages of a channel are needed in the second reading, in which frames are made."""
         return schema_name(self.recording, channel) in {GROUND_TRUTH, SENSOR_VIEW, HOST_DATA}
 
     def meet(self, channel: int) -> bool:

@@ -101,7 +101,7 @@ class Py123dFile(NumberedFile):
         self.losses += lost
 
     def message(self, number: int) -> bytes:
-        """Return the bytes of the message with a number: 0 is the map, the others are frames."""
+        """Return the bytes of a message, given its number: 0 is the map, the others are frames."""
         if number == 0:
             return self._map.text
         time = self.time_of(number)
@@ -115,7 +115,7 @@ class Py123dFile(NumberedFile):
         return self._boxes.message(time, EGO, self._steps[number - 1].tolist(), **more)
 
     def time_of(self, number: int) -> int:
-        """Return the time of the frame with a number, from 1; ns."""
+        """Return the time of a frame, given its number (from 1); ns."""
         return int(self._times[self._steps[number - 1][0]])
 
 

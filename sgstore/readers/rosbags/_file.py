@@ -91,7 +91,7 @@ class RosbagFile(MessageFile):
         self._bag.close()
 
     def message(self, number: int) -> bytes:
-        """Return the bytes of the message with a number, in CDR.
+        """Return the bytes of a message in CDR, given its number.
 
         Raises
         ------
