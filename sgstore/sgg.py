@@ -236,7 +236,7 @@ class SceneGraphGenerator:
         yield from self._driven.chosen(blocks)
 
     def block(self, frames: FrameBlock) -> GraphBlock:
-        """Return the scene graphs of the next frames. The ego is that of the frames.
+        """Return the scene graphs of the next frames. Each frame defines its ego.
 
         Raises
         ------
@@ -357,7 +357,7 @@ class SceneGraphGenerator:
         return self._keeping.entities(kind) & ~self._left_out[node]
 
     def _beyond(self, frames: FrameBlock, poses: EgoPoses, outer: Extent, keys: Ints) -> _Beyond:
-        """Return the known entities near one ego but outside its graphs. ``keys``: rows inside the graphs."""
+        """Return the known entities near one ego but outside its graphs. ``keys``: rows of those inside."""
         if self._config.range.boundless:
             nowhere = np.full(len(frames), np.nan)
             poses = EgoPoses(nowhere, nowhere, nowhere, nowhere)
@@ -397,7 +397,7 @@ class SceneGraphGenerator:
 
     @staticmethod
     def _uneven(known: Bodies) -> int:
-        """Return a bit mask (see ``UNEVEN``): flat bodies, several storeys (bridges), carried bodies."""
+        """Return a bit mask of the special cases in ``UNEVEN``: flat bodies, bridges, carried bodies."""
         flat = ~IS_UPRIGHT[known.kind] & (known.height == 0)
         low, high = known.low_and_high
         near = known.moves | IS_USER[known.kind]
@@ -504,7 +504,7 @@ class SceneGraphGenerator:
     def _beyond_edges(
         self, bodies: Bodies, around: MapContext | None, edges: Edges
     ) -> tuple[Edges, LaneGaps]:
-        """Return edges that appear or disappear if entities outside the graphs count, and gaps of new edges."""
+        """Return edges that appear or disappear if entities outside the graphs count; and gaps of new edges."""
         if around is None:
             return Edges.chained([]), gaps(bodies, None)
         none = np.zeros(0, np.intp)
@@ -896,7 +896,7 @@ def _in_ascending(keys: Ints, some: Ints) -> Bools:
 
 
 def _reduced(frames: FrameBlock, kept: Rows) -> FrameBlock:
-    """Return the frames with all object states removed except the given ones."""
+    """Return the frames with only the given object states."""
     states = frames.states
     return replace(
         frames,
