@@ -100,12 +100,12 @@ def catalog_of(connection: DuckDBPyConnection) -> Catalog:
 
 
 def subset_catalogs() -> dict[str, Callable[[Catalog], Catalog]]:
-    """Return a function for each abstraction that drops nodes or edges. It adapts the store's catalog."""
+    """For each abstraction that drops nodes or edges, return a function that adapts the store's catalog."""
     return {name: partial(_narrowed, name=name, of=of) for name, of in SUBSETS.items()}
 
 
 def _sets(connection: DuckDBPyConnection) -> tuple[DerivedSet, ...]:
-    """Return the derived sets of relations in a store. Without such sets, it avoids a slow import."""
+    """Return the named sets of relations that were derived after ingest. Without any, avoid a slow import."""
     if connection.execute("SELECT 1 FROM derived LIMIT 1").fetchone() is None:
         return ()
     from sgstore.store._derive import sets_of
@@ -265,7 +265,7 @@ def _narrowed(whole: Catalog, name: str, of: Subset) -> Catalog:
 def _derived(
     connection: DuckDBPyConnection, whole: Catalog, name: str, of: list[DerivedSet]
 ) -> dict[str, Any]:
-    """For the traces with a derived set of relations, return the catalog fields that the set changes."""
+    """For the traces with a set of relations derived after ingest, return the fields that it changes."""
     answers = {one.trace_id: frozenset(one.answers) for one in of}
     reaches = {one.trace_id: RelationScope.of(one.settings) for one in of}
     word = literal(name)
@@ -309,7 +309,7 @@ def _derived(
 
 
 def _beyond_derived(beyond: dict[str, str], shadows: dict[str, str], word: str) -> dict[str, str]:
-    """Return SQL for objects outside the graphs, with the edges of a derived set: table name → SQL."""
+    """Return SQL for objects outside the graphs, with the edges of a set derived after ingest: table → SQL."""
     if not beyond:
         return {}
     traces = f"(SELECT d.trace_id FROM derived AS d WHERE d.name = {word})"
@@ -328,7 +328,7 @@ def _beyond_derived(beyond: dict[str, str], shadows: dict[str, str], word: str) 
 def _relations(
     connection: DuckDBPyConnection, whole: Catalog, of: list[DerivedSet]
 ) -> frozenset[str] | None:
-    """Return the relations that a derived set can contain; ``None`` if they are unknown.
+    """Return the relations that a set derived after ingest can contain; ``None`` if they are unknown.
 
     If a trace has a road map, the set lacks the relations that no trace answers: a relation needs only settings
     and a map. Without a map, the set lacks only the relations that the traces can answer in the store.

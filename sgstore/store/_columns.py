@@ -154,7 +154,7 @@ REPEATED: Final = {
 
 @cache
 def _keys(table: str) -> tuple[tuple[str, int, bool], ...]:
-    """Return how a table is sorted: for each sort column, its name, right shift (bits), and if it descends."""
+    """Return the sort order of a table: for each column, its name, a right shift (bits), and if it descends."""
     if table not in ORDERS:
         names = [name for name in types_of(table) if name != "mask" or table not in MASKS]
         return tuple((name, 0, False) for name in names)

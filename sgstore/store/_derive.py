@@ -120,14 +120,14 @@ class DerivedSet:
 
 
 class Deriving:
-    """Derived sets of relations in a store. Created by :attr:`StoreFile.deriving`."""
+    """Named sets of relations derived after ingest. Created by :attr:`StoreFile.deriving`."""
 
     def __init__(self, path: Path, access: Access) -> None:
         self._path = path
         self._access = access
 
     def sets(self) -> tuple[DerivedSet, ...]:
-        """Return all derived sets of relations in the store, sorted by set name and trace."""
+        """Return all sets of relations that were derived after ingest, sorted by set name and trace."""
         with self._access.reading() as connection:
             return sets_of(connection)
 
@@ -147,11 +147,11 @@ class Deriving:
             yield from Graphs().of_trace(connection, trace_id)
 
     def building(self, name: str, trace_id: int) -> Building:
-        """Return a context manager that writes a new derived set of relations for a trace."""
+        """Return a context manager that writes a named set of relations for a trace, from its states."""
         return Building(self._path, self._access, name, trace_id)
 
     def remove(self, name: str) -> tuple[str, ...]:
-        """Delete a derived set of relations from all traces, and return the names of these traces.
+        """Delete a set of relations derived after ingest from all traces, and return the names of these traces.
 
         Raises
         ------
@@ -168,7 +168,7 @@ class Deriving:
         return tuple(one.trace for one in gone)
 
     def graph(self, whole: SceneGraph, name: str) -> SceneGraph:
-        """Return a frame's scene graph, with the nodes and edges of a derived set of relations.
+        """Return a frame's scene graph, with the nodes and edges of a set of relations derived after ingest.
 
         Parameters
         ----------
@@ -230,7 +230,7 @@ class Deriving:
 
 
 def sets_of(connection: DuckDBPyConnection) -> tuple[DerivedSet, ...]:
-    """Return all derived sets of relations in a store."""
+    """Return all sets of relations in a store that were derived after ingest."""
     rows = run(
         connection,
         "SELECT d.name, d.trace_id, t.name AS trace, d.settings, d.digest, d.answers"
@@ -242,7 +242,7 @@ def sets_of(connection: DuckDBPyConnection) -> tuple[DerivedSet, ...]:
 
 
 class Building:
-    """Writer of a derived set of relations for one trace."""
+    """Writer of a set of relations (edges derived after ingest) for one trace."""
 
     def __init__(self, path: Path, access: Access, name: str, trace_id: int) -> None:
         self._access = access
@@ -276,7 +276,7 @@ class Building:
         self._staging.close()
 
     def append(self, graph: GraphBlock) -> None:
-        """Add the graphs of the next frames to a derived set of relations."""
+        """Add the graphs of the next frames to the set of relations."""
         if not len(graph):
             return
         self._staging.settle(whole=int(graph.frames.seq[0]) % BUCKET_FRAMES == 0)
@@ -300,7 +300,7 @@ class Building:
         self._insert("derived_gap", packing.gap_columns(graph, self._trace_id))
 
     def append_labelled(self, seq: Ints, seen: GraphColumns, graphs: Labelled) -> None:
-        """Add the abstracted graphs of the next frames to a derived set of relations.
+        """Add the abstracted graphs of the next frames to the set of relations.
 
         Nodes and edges that a store cannot hold are dropped.
 
@@ -351,7 +351,7 @@ class Building:
         self._staging.insert(table, columns | {"set_name": named.repeat(count)})
 
     def publish(self, settings: Mapping[str, Any], digest: str, answers: tuple[str, ...]) -> None:
-        """Write a derived set of relations to the store in one transaction. It replaces a set of the same name.
+        """Write the set of relations to the store in one transaction. It replaces a set of the same name.
 
         Raises
         ------

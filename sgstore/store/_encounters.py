@@ -63,7 +63,7 @@ FROM (
 
 
 class _MeasuredQuestion:
-    """Criticality measures of object pairs, for one database connection whose SQL statement uses them.
+    """Criticality measures of object pairs, for a database connection that uses them in an SQL statement.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def recorded_measures(connection: DuckDBPyConnection, access: Access, sql: str) 
 
 
 def show_recorded(connection: DuckDBPyConnection, sql: str) -> None:
-    """Add what the SQL uses: the function ``recorded()``, the view ``encounters``, the values of topics."""
+    """Add to a connection what its SQL uses: ``recorded()``, the view ``encounters``, topic values."""
     access = _places.get(id(connection))
     if access is None:
         return

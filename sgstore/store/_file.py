@@ -311,7 +311,7 @@ class StoreFile:
 
     @staticmethod
     def about_sql(sql: str) -> tuple[bool | None, tuple[str, ...]]:
-        """Return which views an SQL statement reads (True: of the world, not of graphs), and notes on kinds.
+        """Return if an SQL statement reads the ``world_…`` views (True) or graphs (False), and notes on kinds.
 
         The first value is False for views of graphs, and ``None`` without such views.
         """

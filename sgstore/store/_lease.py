@@ -136,7 +136,7 @@ _instances_lock = threading.Lock()
 def shared_instance(
     key: tuple[object, ...], make: Callable[[], DuckDBPyConnection]
 ) -> DuckDBPyConnection:
-    """Return the DuckDB instance for a key. The first call creates it. Callers must use cursors of it."""
+    """Return the DuckDB instance for a key, created at the first call. Callers must use cursors of it."""
     with _instances_lock:
         if key not in _instances:
             _instances[key] = make()

@@ -132,7 +132,7 @@ class RecordedValues:
     def _compute(
         self, reader: DuckDBPyConnection, scope: str, measure: str, trace: int, src: int
     ) -> None:
-        """Compute a measure of an object with all others. For an ego, also compute the next traces' egos."""
+        """Compute a measure of an object with all others. For an ego, include the egos of the next traces."""
         if not self._traces:
             self._traces = reader.execute(_TRACES).fetchnumpy()
             self._egos = {one: min(nodes) for one, nodes in _egos(reader).items()}
@@ -203,7 +203,7 @@ def _meetings(
     cache: BoundedCache[_States] | None = None,
     measures: Sequence[str] = (*Meetings.of_motion,),
 ) -> Iterator[Meetings]:
-    """For one object of each trace, yield its encounters with the other objects, in one or more parts."""
+    """For one object of each trace, yield its encounters with the other objects, in parts."""
     ids = traces["trace_id"]
     parts = max(-(-int(traces["states"].sum()) // MOST_STATES), 1) if len(sources) == 1 else 1
     ends = [int(ids[0]) << SEQ_BITS, ((int(ids[-1]) + 1) << SEQ_BITS) - 1]
@@ -232,7 +232,7 @@ def _meetings(
 def _read(
     reader: DuckDBPyConnection, sql: Sequence[str], traces: _Traces, limits: Sequence[int]
 ) -> _States:
-    """Return the object states of some traces: frames, node ids, indices into the states, and the states."""
+    """Return the object states of some traces: frames, node ids, row numbers of the states, and the states."""
     moving, standing = (reader.execute(one, limits).fetchnumpy() for one in sql)
     frames, nodes = (
         np.ma.getdata(moving[name]).astype(np.int64) for name in ("frame_id", "node_id")

@@ -245,7 +245,7 @@ def _buffers(tables: TableFile, table: str) -> Columns:
 
 
 def _filled(tables: TableFile, table: str, staged: Columns) -> Iterator[int]:
-    """Fill the given arrays with the next rows of a table, again and again. Yield the row count each time."""
+    """Fill the given arrays with the next rows of a table, until the table ends. Yield each row count."""
     size, count = len(next(iter(staged.values()))), 0
     for piece in tables.pieces(table):
         first = 0

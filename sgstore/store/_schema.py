@@ -479,7 +479,7 @@ def others_of(connection: DuckDBPyConnection, enum: str) -> tuple[str, ...]:
 
 
 def codes_of(connection: DuckDBPyConnection, enum: str) -> NDArray[np.int8]:
-    """Return a lookup array for an enumeration type: code in the store → code in this process."""
+    """Return an array that translates enumeration codes: code in the store → code in this process."""
     ((labels,),) = connection.execute(f"SELECT enum_range(NULL::{enum})").fetchall()
     return np.array([learn(enum, label) for label in labels], np.int8)
 
@@ -627,7 +627,7 @@ def _differing(
 
 
 def _misplaced(objects: Objects, shape: Shape) -> Iterator[str]:
-    """Yield faults of a store: user tables and views whose names hide objects of ``schema.sql``."""
+    """Yield faults of a store: user tables and views with names that hide objects of ``schema.sql``."""
     for schema, name in sorted(
         (schema, name) for what, schema, name, _ in objects if what != "type"
     ):
@@ -757,7 +757,7 @@ def statements() -> tuple[Tokens, ...]:
 
 
 def tokens_of(sql: str) -> list[str]:
-    """Split an SQL statement into tokens, without comments, quotes of plain names and casts of constants."""
+    """Split an SQL statement into tokens. Drop comments, quotes of plain names and casts of constants."""
     found: list[str] = []
     for match in _TOKEN.finditer(sql):
         word = match[0]

@@ -171,7 +171,7 @@ class Staging:
         return {**self._new, "relation": relations}
 
     def shared(self) -> StagedRows:
-        """Write all tables, and return their rows for other traces. Then no more rows may be added to them."""
+        """Write all tables, and return their rows for other traces. Afterwards, the tables must not grow."""
         for table in [*self._waiting]:
             self.write(table)
         return StagedRows(self._file.behind(0), dict(self.checksums), dict(self._new))
@@ -258,7 +258,7 @@ class Staging:
             self._file.append(table, some, said)
 
     def _merged_runs(self, table: str, runs: list[Piece]) -> Iterator[Columns]:
-        """Merge sorted groups of rows of a table. Yield all rows with the same value in the first column."""
+        """Merge sorted groups of rows of a table. Yield together the rows with the same value in column one."""
         name, texts = _RUNS[table], self._texts_of(table)
         firsts = [self._file.column(run, name) for run in runs]
         for value in np.unique(np.concatenate([np.unique(first) for first in firsts])).tolist():

@@ -87,7 +87,7 @@ _NUMBERS: Final[Mapping[str, tuple[str, object]]] = {
 
 
 def _arrays_of(block: Sequence[list[Any]], kinds: Sequence[str]) -> dict[str, Any] | None:
-    """Return columns as arrays, which DuckDB reads ten times faster. ``None`` if the values are not suitable.
+    """Return columns as arrays, because DuckDB reads arrays ten times faster. ``None`` if impossible.
 
     NaN is unsuitable, because it would become NULL.
     """

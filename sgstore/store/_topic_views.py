@@ -103,7 +103,7 @@ def _show(connection: DuckDBPyConnection, access: Access, facts: TopicFacts, top
 
 @dataclass(frozen=True, slots=True)
 class _Source:
-    """Messages of a topic, either in a table of the store or in files made from one recording."""
+    """Messages of a topic, either from a table of the store or from files made from a recording."""
 
     table: str
     fields: Mapping[str, str]
@@ -309,7 +309,7 @@ def topic_facts(connection: DuckDBPyConnection, access: Access) -> dict[str, Top
 
 
 def _fields(held: ref[Access], topic: str) -> Mapping[str, TopicField]:
-    """Return the fields of a topic, from stored tables and from one recording whose topic is not stored."""
+    """Return the fields of a topic: from stored tables, and from one recording without such a table."""
     access = held()
     if access is None:
         raise StoreError("the store of these topics is closed")

@@ -337,7 +337,7 @@ class Segment:
         self._staging.write("payload")
 
     def _bucket_columns(self, time_ns: Ints, period_ns: int) -> Columns:
-        """Return one row per 60 frames, with two bit masks: the frames, and those without a gap before them."""
+        """Return one row per 60 frames with two bit masks: of all frames, and of those without a gap before."""
         seq = np.arange(len(time_ns))
         one = np.left_shift(1, seq % BUCKET_FRAMES)
         step = np.diff(time_ns, prepend=time_ns[0])
