@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Valuation:
-    """Truth values of all conditions of a plan in the current frame, for each known combination of nodes.
+    """Truth values of all conditions of a plan in the current frame, for each combination of nodes seen so far.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ class Valuation:
         return letters, self._measure(list(rows), letters, memory)
 
     def _told(self) -> dict[Partial, int]:
-        """Return, for each partial binding, the true single-frame conditions as bits of an integer.
+        """Return the true single-frame conditions of each partial binding (some nodes missing), as bits.
 
         A partial binding has nodes for some variables.
         """
@@ -161,7 +161,7 @@ class Valuation:
         letters: dict[Partial, int],
         memory: Callable[[Partial], Memory | None],
     ) -> dict[Partial, Memory]:
-        """Evaluate expressions over time. Set the bits of true ones; return each binding's new memory."""
+        """Evaluate expressions over time, and set a bit for each true one. Return the state for later."""
         self._courses.step()
         columns: dict[str, Bools] = {}
 

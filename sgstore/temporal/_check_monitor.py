@@ -143,7 +143,7 @@ class ObligationState:
 
 @dataclass(frozen=True, slots=True)
 class ObligationStep:
-    """Result of one frame for a monitored formula: its next state; if a violation begins, and if one ends.
+    """Result of one frame for a monitored formula: next state, and whether a violation begins or ends.
 
     Attributes
     ----------
@@ -240,7 +240,7 @@ class Automaton:
         return found
 
     def _until(self, state: ObligationState, tick: Tick) -> tuple[int, int]:
-        """Return the time (ns) and frame number until which no time bound of the formula begins or ends."""
+        """Return the time (ns) and frame number up to which no time bound of the formula begins or ends."""
         bounds = [begun for term in state.terms for begun in term.bounds()]
         for part, (_, entries) in zip(self._progression.past, state.past, strict=True):
             if isinstance(part, Since):
@@ -377,7 +377,7 @@ class _CheckEntry:
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
-    """Second state of a monitored binding. In this state, unknown conditions count as violations.
+    """Second state of a monitored combination of entities. Here, unknown conditions count as violations.
 
     Attributes
     ----------
@@ -544,7 +544,7 @@ class CheckMonitor:
         letter: int,
         here: FrameTime,
     ) -> Doubt | None:
-        """Return a binding's second state, in which unknown conditions count against the check; or None.
+        """Return the state of some entities in which unknown conditions count as violations; None without one.
 
         ``None`` means that they change nothing.
         """
@@ -600,7 +600,7 @@ class CheckMonitor:
     def _as_sgsm(
         self, entry: _CheckEntry, step: ObligationStep, here: FrameTime, memory: Memory
     ) -> _CheckEntry:
-        """Return the next state of a monitored combination of entities, for checks in SGSM mode.
+        """Return the next state of entities. In SGSM mode, a violation lasts while the trace must not end.
 
         In this mode, a violation lasts while the trace must not end.
         """
@@ -648,7 +648,7 @@ class CheckMonitor:
                     yield self._event("violated", here, key, entry.since, entry.since)
 
     def _covered(self, row: Partial, entry: _CheckEntry) -> Iterator[Key]:
-        """Yield the combinations of known entities that share one monitoring state."""
+        """Yield all combinations of known entities to which a monitoring state applies."""
         if None not in row:
             yield row  # type: ignore[misc]
             return

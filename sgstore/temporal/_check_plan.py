@@ -67,7 +67,7 @@ _CONTRARY: Final = {"+": "-", "-": "+", "": "*", "*": ""}
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """Rules for part of a formula: if unknown values count as true, and if absent entities do.
+    """Rules for part of a formula: whether unknown values and absent entities count as true.
 
     Attributes
     ----------
@@ -101,7 +101,7 @@ CERTAIN: Final = Reading("", absent=False)
 
 
 def base_name(name: str) -> str:
-    """Return a proposition's name without the suffix ``+`` or ``-``, which defines how unknowns count."""
+    """Return a proposition's name without its suffix: ``+`` or ``-``, the rule for unknown values."""
     return name.rstrip("+-")
 
 
@@ -187,7 +187,7 @@ class CheckPlan(Plan):
                 return self.read(found, reading)
 
     def _guarded(self, expression: b.Bound) -> frozenset[str]:
-        """Return the nodes whose absence makes a condition false."""
+        """Return the nodes that must be present for a condition to be true."""
         match expression:
             case b.Operation("AND", operands):
                 return frozenset().union(*map(self._guarded, operands))
@@ -197,7 +197,7 @@ class CheckPlan(Plan):
                 return self._things(expression)
 
     def _counted(self, things: frozenset[str], reading: Reading) -> bool | None:
-        """If an entity is absent, return the value of the condition; None if it depends on the entity."""
+        """Return the value of the condition for absent entities; None if their quantifiers disagree."""
         if reading.absent is not None:
             return reading.absent
         words = {word for word, nodes in self._levels if nodes & things} or {self._levels[0][0]}
@@ -274,7 +274,7 @@ class CheckPlan(Plan):
         return found
 
     def _asked(self, wanted: b.Bound, things: frozenset[str], sign: str) -> f.Formula:
-        """Return a formula that is true if a condition is true, and if wanted, also if it is unknown.
+        """Return a formula: true if a condition is true; with a ``sign``, also if the condition is unknown.
 
         If unknown values count as true, it is also true for them.
         """
@@ -301,7 +301,7 @@ class CheckPlan(Plan):
     # Conditions on several frames
 
     def _over_frames(self, expression: b.Bound, reading: Reading) -> f.Formula:
-        """Return the formula of a comparison or similar condition whose value depends on several frames."""
+        """Return the formula of a comparison or similar condition that depends on several frames."""
         things = self._things(expression)
         counted = self._counted(things, reading)
         state = self._state(expression)
@@ -329,7 +329,7 @@ class CheckPlan(Plan):
         return name
 
     def _doubtful(self, expression: b.Bound, state: b.Bound) -> b.Bound | None:
-        """Return a condition that is true if a comparison over frames is unknown; None if it never is."""
+        """Return a condition that is true if the value of a comparison over frames is unknown, or else None."""
         ways: list[b.Bound] = []
         if any(self._may_be_unknown(part) for part in b.walk(state)):
             ways.append(b.Operation(">", (state, _number(0)), Type.boolean))
@@ -570,7 +570,7 @@ def _in_favour(expression: b.Bound) -> b.Bound:
 
 
 def _absence_tried(expression: b.Bound, *, counted: bool) -> b.Bound:
-    """Return a condition evaluated in two ways, with absences as false and as true; joined by OR or AND.
+    """Evaluate a condition twice: absent entities count as false, then as true. Join the results by OR or AND.
 
     If ``counted``, one result must be true, otherwise both.
     """
@@ -593,7 +593,7 @@ def _case(condition: b.Bound, then: b.Bound, otherwise: b.Bound) -> b.Operation:
 
 
 def _contrary(condition: b.Bound) -> b.Bound:
-    """Return the negation of a condition whose value depends on several frames.
+    """Return the negation of a condition that depends on several frames.
 
     It is false too if a number of two entities is missing.
     """

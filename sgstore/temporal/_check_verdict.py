@@ -372,7 +372,7 @@ def verdict_of(
     violations: Callable[[int, Mapping[str, str]], tuple[ViolationInterval, ...]],
     last: ViolationInterval,
 ) -> Verdict:
-    """Return a copy of a verdict, completed by its violations and by the entities that decide it.
+    """Return a copy of a verdict, with its violations and the entities that decide it added.
 
     Witnesses bind the outermost quantifiers of one kind.
 

@@ -441,14 +441,14 @@ class StoreCheck:
 
     @cached_property
     def _premises(self) -> Premises | None:
-        """Query sets that limit the needed data; None if the status of each frame is requested."""
+        """Sets of queries. A violation needs matches of all queries of one set. None: all traces are needed."""
         asks = self._plan.asks | self._values.asks
         found = premises_of(self._check, self._plan, self._formula, asks)
         return None if self._want_status else found
 
     @property
     def _narrowing(self) -> Premises | None:
-        """Query sets that limit the data to read; None if the robustness of the check is requested."""
+        """Sets of queries that limit the traces to read; None if the robustness of the check is requested."""
         return None if self._check.robustness else self._premises
 
     def readers(
@@ -469,7 +469,7 @@ class StoreCheck:
         yield from self._unknown(self._knowing, self._lacks)
 
     def watched(self) -> dict[str, str]:
-        """Return the query that finds the frames of each variable's entities: variable → query name.
+        """For each variable, return the name of the query that finds the frames with its entities.
 
         Later reads include this query.
         """
@@ -722,7 +722,7 @@ class StoreCheck:
                 return
 
     def _least_margins(self, trace: TraceReader, bindings: Keys) -> Floats | None:
-        """Return each entity combination's robustness, if smallest values suffice to compute it; or None."""
+        """Return the robustness of each combination of entities, from stored minimum values; or None."""
         doubts = {doubt for _, doubt in self._plan.states.values() if doubt is not None}
         if not self._least or any(len(trace.relations[name].frames) for name in doubts):
             return None
@@ -740,7 +740,7 @@ class StoreCheck:
         return found
 
     def margins(self, trace: TraceReader) -> Floats:
-        """Return the robustness margins of the check on a trace. NaN: only unknown numbers decide.
+        """Return the robustness margins of the check on a trace. NaN: the margin depends on an unknown number.
 
         For an ``ALWAYS`` check over all entities: shape (F,), the margin of each frame. Unknown entities and
         frames are ignored. For any other check: shape (1,), the margin of the whole trace.

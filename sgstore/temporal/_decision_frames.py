@@ -109,7 +109,7 @@ def _known_until(formula: Until, table: PropositionTable, *, ended: int | None) 
 
 
 def _is_over(bound: Bound, table: PropositionTable, widened: int) -> Bools:
-    """Return a mask of the frames whose time bound is over, or unlimited, when the trace ends."""
+    """Return a mask of the frames with a time bound that is over, or unlimited, when the trace ends."""
     if bound.high is None:
         return np.ones(len(table.times), np.bool_)
     if bound.frames:
@@ -179,7 +179,7 @@ def _chained(
     *,
     least: bool,
 ) -> Places:
-    """For each frame, return the frame at which an *until* is decided, from those of its operands.
+    """For each frame, return the frame at which an *until* is decided, from decision frames of its operands.
 
     It uses minima and maxima of the numbers.
 

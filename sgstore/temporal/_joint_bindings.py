@@ -26,7 +26,7 @@ ROWS: Final = 2_000_000
 
 @dataclass(frozen=True, slots=True)
 class JoinedBindings:
-    """Node combinations that match several sequence steps, and the index of each in the steps' tables.
+    """Node combinations that match several sequence steps, and the row of each in the table of every step.
 
     Attributes
     ----------

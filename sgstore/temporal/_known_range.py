@@ -25,7 +25,7 @@ SELECT frame_id >> 24 AS trace_id, max(speed) AS speed FROM known_state GROUP BY
 
 @dataclass(frozen=True, slots=True)
 class ShortRange:
-    """Two reasons: why the stored range of a trace is too short for the verdict true, and for false.
+    """Two reasons: why the distance stored around the ego is too small for the verdict true, and for false.
 
     An empty text means that it can.
 
@@ -38,14 +38,14 @@ class ShortRange:
     false: str = ""
 
     def of(self, *, holds: bool) -> str:
-        """Return the reason why the range of the trace is too short for the given verdict.
+        """Return the reason why the distance stored around the ego is too small for the given verdict.
 
         An empty text means that it does.
         """
         return self.true if holds else self.false
 
     def or_else(self, other: ShortRange) -> ShortRange:
-        """Return a copy of the two reasons, with each empty one replaced by that of ``other``."""
+        """Return the two reasons. An empty reason is replaced by the same reason of ``other``."""
         return ShortRange(self.true or other.true, self.false or other.false)
 
 

@@ -104,7 +104,7 @@ AT_FRAME: Final = -1
 
 @dataclass(frozen=True, slots=True)
 class Stretches:
-    """First and last frame of each match, and the row of its nodes in the arrays of values.
+    """First and last frame of each match, and the row for its nodes in the arrays of values.
 
     Attributes
     ----------

@@ -37,7 +37,7 @@ Span = tuple[int, int]
 
 
 class _Course:
-    """Recent values of one expression for all matched nodes. A value stays as long as a match may need it."""
+    """Recent values of one expression for all matched nodes. A value stays until no later match can need it."""
 
     def __init__(
         self,
@@ -148,7 +148,7 @@ class MatchValues:
             course.step()
 
     def forget(self, kept: Iterable[int]) -> None:
-        """Merge the values of old frames. ``kept``: frames at which a later match may begin or end.
+        """Merge the values of old frames, except those in ``kept``, at which a later match may begin or end.
 
         Parameters
         ----------

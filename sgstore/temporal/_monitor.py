@@ -321,7 +321,7 @@ class Monitor:
         return f"<Monitor of {', '.join(self.names)} after {number_of(seen, 'frame')}>"
 
     def _of_scope(self, ego: str | None, *, world: bool) -> tuple[int, QueryCache]:
-        """Return the query cache for an ego, and its index. ``world``: also entities outside the graphs."""
+        """Return the query cache for an ego, and its index. ``world`` adds entities outside the graphs."""
         if (ego or "") not in self._egos:
             self._egos.append(ego or "")
         scope = self._egos.index(ego or ""), world

@@ -137,7 +137,7 @@ class PlanValues(SignalValues):
         self._tests: dict[str, Column] = {}
 
     def evaluation(self, counted: str) -> PlanValues:
-        """Return a copy that counts unknown conditions as given: for the check, or against it.
+        """Return a copy in which unknown conditions all count for the check, or all count against the check.
 
         Other values are shared.
         """
@@ -205,7 +205,7 @@ class PlanValues(SignalValues):
         return found.column(places, len(self._trace))
 
     def _state(self, of: Ask | None, doubt: str | None) -> Column:
-        """Return 0 for each node combination and frame in which a value is known, otherwise 1, (B, F).
+        """For each node combination and frame, return 1 if the value is unknown, otherwise 0, (B, F).
 
         Frames without the entity are masked.
         """
@@ -252,12 +252,12 @@ class Premises:
         return sorted(self.asks, key=rank)
 
     def left(self, relations: Mapping[str, TimedRelation]) -> list[frozenset[str]]:
-        """Return the sets that remain possible: none of their queries was run without a match."""
+        """Return the sets of queries that are still possible: all of their queries run so far had a match."""
         empty = {name for name, one in relations.items() if not len(one.keys)}
         return [one for one in self.alternatives if not one & empty]
 
     def nodes(self, ask: Ask, traces: Iterable[TraceReader]) -> dict[str, Ints]:
-        """Return the only nodes of some traces that a query has to search: variable → node ids."""
+        """For some traces, return the nodes that a query can be limited to: variable → node ids."""
         found: dict[str, list[Ints] | None] = {name: [] for name in ask.variables}
         for trace in traces:
             for one in self.left(trace.relations):
@@ -340,7 +340,7 @@ def groups(
     gaps: str = "break",
     within: Window | None = None,
 ) -> Iterator[TraceGroup]:
-    """Yield the same traces as :func:`traces`, loaded into memory in groups, by trace id. It is faster."""
+    """Yield the same traces as :func:`traces`, by trace id. They are loaded in groups, which is faster."""
     every = sorted(extents(catalog))
 
     def ask(window: Window | None) -> tuple[TraceGroup, int]:
@@ -648,7 +648,7 @@ def _relate(
 
 
 def _deciding(asks: Mapping[str, Ask], keys: Keys, values: Sequence[Any]) -> Bools:
-    """Return a mask of the rows to keep if only the smallest value of the same nodes counts.
+    """Return a mask of the rows to keep: of rows with the same nodes, only that with the smallest value.
 
     Rows that meet a condition, and those with an unknown value, are always needed.
     """

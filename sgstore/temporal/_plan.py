@@ -114,7 +114,7 @@ class Ask:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Test:
-    """Expression whose value depends on several frames, evaluated for all frames of a trace.
+    """Expression that depends on several frames, evaluated for all frames of a trace.
 
     Attributes
     ----------
@@ -381,7 +381,7 @@ def plan_of_steps(query: b.Query, steps: Sequence[BoundStep]) -> Plan:
 
 
 def kept_throughout(check: b.BoundCheck) -> b.Bound | None:
-    """Return the condition that a check requires in every frame; None if it is not such a check."""
+    """Return the condition that a check requires in every frame; None for another form of check."""
 
     def lasting(formula: b.Bound) -> b.Bound | None:
         match formula:
@@ -569,7 +569,7 @@ def _never_unknown(expression: b.Bound) -> bool:
 def plan_text(
     plan: Plan, formula: f.Formula, reset: f.Formula | None, catalog: Catalog | None = None
 ) -> str:
-    """Return an evaluation plan as text: temporal formula and queries. ``catalog`` adds the SQL."""
+    """Return an evaluation plan as text: temporal formula and queries. With ``catalog``, also their SQL."""
     lines = [f"formula {formula_text(formula)}"]
     lines += [f"reset {formula_text(reset)}"] if reset is not None else []
     lines += needs_text(plan, catalog)
@@ -577,7 +577,7 @@ def plan_text(
 
 
 def needs_text(plan: Plan, catalog: Catalog | None = None) -> list[str]:
-    """Return the queries and expressions of an evaluation plan as lines of text. ``catalog`` adds the SQL."""
+    """Return the queries and expressions of a plan as lines of text. With ``catalog``, also their SQL."""
     lines: list[str] = []
     for ask in plan.asks.values():
         where = " AND ".join(value_text(part) for part in ask.query.scope.where) or "TRUE"
@@ -632,7 +632,7 @@ def length_text(length: Length) -> str:
 
 
 def _refuse_large(value: b.Bound) -> None:
-    """Raise an error if an expression has integers too large for float64, which stores them inexactly.
+    """Raise an error if an expression has integers that float64 cannot store exactly.
 
     Single-frame conditions are exact.
 

@@ -197,7 +197,7 @@ class _Ways:
         return names | set(test.presence.values())
 
     def _holds_without(self, test: Test) -> bool:
-        """True if a condition over several frames is true in case none of its queries has matches."""
+        """True if a condition over several frames is true when none of its queries has a match."""
         asks, two = self._plan.asks, np.arange(2)
         clock = Clock(two * _LONG, two * 0, _LONG)
         relations = {name: no_rows(ask) for name, ask in asks.items()}
@@ -220,7 +220,7 @@ def _any(parts: Sequence[Alternatives]) -> Alternatives:
 
 
 def _all(parts: Sequence[Alternatives]) -> Alternatives:
-    """Combine lists of sets: each result joins one set of each list. Lists that are too long are skipped."""
+    """Combine lists of sets: each result is the union of one set of each list. Long lists are skipped."""
     found = _ALWAYS
     for part in sorted(parts, key=len):
         if len(found) * len(part) <= MOST:

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 
 class Term:
-    """Obligations of a temporal formula (conditions on later frames): one, or several joined by logic.
+    """Obligations of a temporal formula (conditions on later frames): a single one, or an ``and`` or ``or``.
 
     Equal terms are one object.
 
@@ -95,7 +95,7 @@ class Term:
                 yield from operand.bounds()
 
     def implies(self, other: Term) -> bool:
-        """True if these obligations imply ``other``, which differs only in the start of time bounds."""
+        """True if these obligations imply ``other``, which differs only in the start times of its bounds."""
         pairs = zip(self.begins, other.begins, strict=True)
         return all((a <= b) if self.sense > 0 else (a >= b) for a, b in pairs)
 
@@ -216,7 +216,7 @@ class Terms:
 
 
 def least(terms: Iterable[Term], word: str = "and") -> list[Term]:
-    """Return the obligations that remain in an ``and`` or ``or`` if one that another implies is dropped.
+    """Return the obligations of an ``and`` or ``or`` without those that another one makes redundant.
 
     So a repeated obligation of an ``ALWAYS`` is stored once.
     """
@@ -394,7 +394,7 @@ class ProgressionFrame:
         return terms.joined("or", (right, terms.joined("and", (left, later))))
 
     def resolved(self, term: Term) -> Term:
-        """Return earlier obligations after this frame: conditions that this frame decides are replaced."""
+        """Return earlier obligations after this frame. Conditions that are decided now become true or false."""
         if term not in self._resolved:
             self._resolved[term] = self._resolve(term)
         return self._resolved[term]
@@ -433,7 +433,7 @@ class ProgressionFrame:
     def _known_past(
         self, part: Since, entries: tuple[Entry, ...], right: Term
     ) -> tuple[Term, tuple[Entry, ...]]:
-        """Return the value of a *since* with known operands at this frame, and its memory.
+        """Return the value of a *since* with known operands at this frame, and its state for the next frame.
 
         The memory is the list of frames in which the right operand was true.
         """

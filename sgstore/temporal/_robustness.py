@@ -183,7 +183,7 @@ def margin_columns(
 
 
 def least_values(plan: CheckPlan, always: Formula) -> dict[str, frozenset[str]]:
-    """Return the values whose minimum alone determines the robustness margin of ``ALWAYS p``.
+    """Return those values whose minimum determines the robustness margin of ``ALWAYS p``.
 
     Then each margin in p is the known value of a signal, and frames without its entities count in favour. The
     result is empty for any other p, because a frame with another value may decide.

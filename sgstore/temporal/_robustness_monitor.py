@@ -175,16 +175,16 @@ class _Part:
     tape: _Tape = field(default_factory=lambda: _Tape(0, np.zeros((0, 1, 1), MARGIN)))
 
     def join(self, one: Margins, other: Margins) -> Margins:
-        """Return the margins of ``one OR other``. Under a negation, the operator becomes ``AND``."""
+        """Return the margins of ``one OR other``. If the part is negated, the operator is ``AND``."""
         return _better(one, other, greatest=self.positive)
 
     def meet(self, one: Margins, other: Margins) -> Margins:
-        """Return the margins of ``one AND other``. Under a negation, the operator becomes ``OR``."""
+        """Return the margins of ``one AND other``. If the part is negated, the operator is ``OR``."""
         return _better(one, other, greatest=not self.positive)
 
     @property
     def nothing(self) -> float:
-        """Margin of an always false condition: minus infinity; plus infinity under a negation."""
+        """Margin of a condition that is always false: minus infinity. If the part is negated, plus infinity."""
         return -np.inf if self.positive else np.inf
 
 
@@ -325,7 +325,7 @@ class MarginStream:
                 self._answer = part.tape.at(0)
 
     def _replace(self, bit: int, value: Margins) -> None:
-        """When the next frame provides a margin, put it into all results that used the unknown margin."""
+        """Insert a margin of the next frame into all stored results that depend on it."""
         low, high = self._vertices & ~bit, self._vertices | bit
 
         def shown(old: Margins) -> Margins:
@@ -350,7 +350,7 @@ class MarginStream:
         return found
 
     def _told(self, part: _Part) -> Iterator[Margins]:
-        """Yield the margins of part of the formula that this frame makes known, frame after frame."""
+        """For part of the formula, yield the margins that are known after this frame, ordered by frame."""
         match part.formula:
             case TruthConstant(value=value):
                 if not self._ended:

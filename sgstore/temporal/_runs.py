@@ -205,7 +205,7 @@ class BindingRows:
 
     @cached_property
     def starts(self) -> Ints:
-        """Index of the first row of each run: a series of rows with consecutive frames and the same nodes."""
+        """Index of the first row of each run (series of rows with consecutive frames and the same nodes)."""
         follows = np.diff(self.frames, prepend=-2) == 1
         return np.flatnonzero(self.fresh | ~follows | self.line.begins[self.frames])
 
@@ -225,7 +225,7 @@ class BindingRows:
 
 
 class RowValues(SignalValues):
-    """Values of expressions over several frames, for the rows of a table of matches, (1, R).
+    """Values of expressions over several frames, one for each row of a table of matches, (1, R).
 
     Parameters
     ----------

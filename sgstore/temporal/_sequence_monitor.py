@@ -86,7 +86,7 @@ class StepFrame:
 
 
 class StepState:
-    """State of a sequence step for one combination of nodes: frames that match, and undecided frames.
+    """State of a sequence step for one combination of nodes: frames that match, and frames still undecided.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ class StepState:
 
     @property
     def undecided(self) -> int:
-        """Number of the first frame without a decision if the step matches; :data:`NEVER` without one."""
+        """Number of the first frame that needs later frames to decide if the step matches; or :data:`NEVER`."""
         if self._waiting:
             return self._waiting[0].number
         return self._queue[0][0] if self._queue else NEVER
@@ -143,12 +143,12 @@ class StepState:
         yield from (number for number, _, _ in self._queue)
 
     def ask(self, holds: Needs, *, gap: bool) -> None:
-        """Add the next frame in which the step may match. ``holds``: conditions that later frames decide."""
+        """Add the next frame in which the step may match. ``holds``: its conditions on later frames."""
         self._queue.append((self._pulse.tick.number, self._pulse.tick.time, gap))
         self.open.append(holds)
 
     def decide(self, needs: list[Needs]) -> None:
-        """Decide, for waiting frames, if the step matches there. ``needs`` are their updated conditions."""
+        """Decide if the step matches in frames that are undecided so far. ``needs``: updated conditions."""
         self.open = deque(needs)
         while self.open and isinstance(self.open[0], bool):
             number, time, gap = self._queue.popleft()
@@ -203,7 +203,7 @@ Binding = dict[str, int]
 
 
 def joined(one: Binding, names: tuple[str, ...], key: Key, apart: frozenset[str]) -> Binding | None:
-    """Merge the nodes of two matches. Return None if they conflict, or use a node twice that must differ."""
+    """Merge the nodes of two matches. Return None for a conflict, or if nodes that must differ are equal."""
     both = dict(one)
     for name, node in zip(names, key, strict=True):
         known = both.get(name)
@@ -405,7 +405,7 @@ class SequenceMonitor:
 
     @cached_property
     def _lasting(self) -> dict[StepWay, frozenset[int]]:
-        """For each alternative, the steps whose run of frames must end before a match is reported."""
+        """For each alternative, the steps that must have stopped matching before a match is reported."""
         return {way: frozenset(self._lasting_in(happen)) for way, happen in self._happen.items()}
 
     def _lasting_in(self, happen: tuple[int, ...]) -> Iterator[int]:
@@ -722,7 +722,7 @@ def _within(link: StepLink, place: StepFrame, other: StepFrame, tolerance: int) 
 
 
 class _Conditions:
-    """Conditions of sequence steps whose value depends on several frames."""
+    """Conditions of sequence steps that need values of several frames."""
 
     def __init__(
         self, query: Query, steps: Sequence[BoundStep], questions: QueryCache, pulse: StreamClock
@@ -782,7 +782,7 @@ class _Conditions:
 
 
 def settled(needs: list[tuple[Partial, Term]]) -> Needs:
-    """Return True if a condition is true, False if all are false, otherwise those not decided yet."""
+    """Return True if a condition is true, False if all are false, otherwise those that are still open."""
     if any(term.word == "true" for _, term in needs):
         return True
     left = tuple((row, term) for row, term in needs if term.word != "false")
@@ -835,7 +835,7 @@ class ExpressionMonitor(SequenceMonitor):
         return way.steps[0], told, run
 
     def _see(self, way: StepWay, binding: Binding) -> None:
-        """Find the matches of one alternative sequence with given nodes, and keep the best of each start.
+        """Find the matches of one alternative sequence with given nodes. Keep only the best for each start.
 
         Only the best match of each start is kept.
         """
@@ -854,7 +854,7 @@ class ExpressionMonitor(SequenceMonitor):
                     self._best[group] = found
 
     def _better(self, one: FoundMatch, other: FoundMatch) -> bool:
-        """True if the first match is preferred to the second one.
+        """True if the first of two matches is preferred.
 
         For equal frames, the first alternative of the query is preferred.
         """
@@ -898,7 +898,7 @@ class ExpressionMonitor(SequenceMonitor):
     def _may_be_earlier(
         self, standing: _Standing, frames: tuple[int, ...], *, before: bool
     ) -> bool:
-        """True if an incomplete match can still be completed with frames before the given ones."""
+        """True if an incomplete match can still end before the complete match with the given frames."""
         way, at, binding, place = standing
         if at == len(way.links):
             return False  # an ended match is already known
@@ -926,7 +926,7 @@ class ExpressionMonitor(SequenceMonitor):
     def _next_step(
         self, way: StepWay, at: int, binding: Binding, place: StepFrame
     ) -> tuple[int, StepLink, bool]:
-        """Return the next required step of a sequence, and its time relation to the previous step.
+        """Return the index of the next required step of a sequence, and its time relation to the step before.
 
         The third result is True if a ``NOT MATCH`` between them is undecided.
         """
@@ -985,7 +985,7 @@ class ExpressionMonitor(SequenceMonitor):
         return min(found, default=NEVER)
 
     def _followed(self, n: int, key: Key, places: list[StepFrame]) -> list[StepFrame]:
-        """Return the stored frames of a first step at which a later match can begin."""
+        """Return the stored frames of a sequence's first step from which a later match can begin."""
         binding = dict(zip(self._columns[n], key, strict=True))
         ways = [way for way in self._asked if way.steps[0] == n]
         found: list[StepFrame] = []
@@ -998,7 +998,7 @@ class ExpressionMonitor(SequenceMonitor):
         return found
 
     def _open_ended(self, way: StepWay) -> bool:
-        """True if only the first frame of each run of the first step counts, as the next step has no limit.
+        """True if only the first frame of each run of the first step counts: the next step has no time limit.
 
         A run is a series of frames in which the step matches.
         """

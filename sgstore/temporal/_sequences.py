@@ -59,7 +59,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Leg:
-    """Time relation of two sequence steps, with the frames of the second step and of the step between.
+    """Time relation of a step to the next one, with the frames of the next and of the forbidden step between.
 
     Attributes
     ----------
@@ -234,7 +234,7 @@ def matches_of(line: BindingLine, first: Ints, legs: Sequence[Leg], policy: str)
 
 
 def _next(possible: Ints, low: Ints, high: Ints, *, latest: bool) -> tuple[Ints, Bools]:
-    """Return the first or last possible position in each window, and a mask of non-empty windows."""
+    """Return the first (or last) possible position in each window, and a mask of windows that have one."""
     if not len(possible):
         return low, np.zeros(len(low), np.bool_)
     if latest:
@@ -597,7 +597,7 @@ class Finder:
         return owner * line.stride + relation.frames[rows]
 
     def _legs(self, way: StepWay, at: list[Ints], absent: dict[int, Ints]) -> list[Leg]:
-        """Return the time relations between steps, without ``NOT MATCH`` steps, which become part of them.
+        """Return the time relations between steps. A ``NOT MATCH`` step is included in the relation around it.
 
         A ``NOT MATCH`` step becomes part of a time relation.
         """
@@ -687,7 +687,7 @@ def _whole(window: Window | None) -> Window | None:
 def _chunks(
     group: TraceGroup, relation: TimedRelation
 ) -> Iterator[tuple[TraceReader, TimedRelation, int]]:
-    """Yield parts of a table: each with one trace and few node combinations, and its first row."""
+    """Divide a table into parts with one trace and few node combinations. Yield each part and its first row."""
     for place in np.unique(relation.keys[:, 0]).tolist():
         trace, whole = group.reader(place), group.part(relation, place)
         begin = int(relation.starts[np.searchsorted(relation.keys[:, 0], place)])

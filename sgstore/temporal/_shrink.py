@@ -151,7 +151,7 @@ def shortest_clips(
 
 
 def _span(file: StoreFile, clip: str) -> Span:
-    """Return the first and last frame of a clip given as text."""
+    """Return the first and last frame of a clip that is given as text."""
     ends = range_of(clip)
     if ends is None:
         raise StoreError(f"{clip}: no clip; expected TRACE@12s..18s or TRACE#120..180")

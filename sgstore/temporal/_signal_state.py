@@ -92,12 +92,12 @@ class SignalState:
 
     @property
     def begun(self) -> Memory:
-        """Initial memory of functions over time and past operators, before the first frame."""
+        """State of functions over time and past operators before the first frame."""
         pasts = (progression.begun for progression in self.conditions.values())
         return (*(None for _ in self.places), *pasts)
 
     def step(self) -> None:
-        """Add the frame that the clock shows. The clock must be updated first."""
+        """Add the next frame. Its time must already be in the clock."""
         tick = self.pulse.tick
         if self.gap:
             self._frames.clear()
@@ -113,7 +113,7 @@ class SignalState:
 
     @property
     def oldest(self) -> int:
-        """Number of the oldest frame whose values an expression can still need."""
+        """Number of the oldest frame that is still needed to compute an expression."""
         return self._frames[0][1]
 
     def window(self, course: b.SignalCall) -> tuple[int, int]:
@@ -145,7 +145,7 @@ class SignalState:
         atom: Callable[[str], Bools],
         signal: Callable[[Ask], Column],
     ) -> tuple[dict[str, Column], list[Memory]]:
-        """Return the values of all expressions in this frame, and the new memory of each binding.
+        """Return the values of all expressions in this frame, and the state that each binding needs later.
 
         There is one of each for every node combination.
 
@@ -193,7 +193,7 @@ class _Now(SignalValues):
         self._rows = len(memories)
 
     def memories(self) -> list[Memory]:
-        """Return the memory of each node combination for the next frame."""
+        """Return the state that each node combination needs at the next frame."""
         columns = [self._new[course] for course in self._all.places]
         columns += [self._kept[condition] for condition in self._all.conditions]
         return list(zip(*columns, strict=True)) if columns else [() for _ in range(self._rows)]

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def topics_of(part: object) -> Iterator[TopicValue]:
-    """Yield the topic values, such as a field of ``/imu``, that part of a query or check uses."""
+    """Yield the topic values, such as a field of ``/imu``, in part of a query or check."""
     if isinstance(part, FrameAttribute):
         if (value := part.attribute.topic) is not None:
             yield value

@@ -87,7 +87,7 @@ class TimedRelation:
         return TimedRelation(keys, starts, self.frames[rows] - first, values)
 
     def find(self, wanted: Keys) -> Ints:
-        """Return the index of each given node combination in the table, shape (B,). -1 if it is not there."""
+        """Return the index of each given node combination in the table, shape (B,); -1 for a missing one."""
         if not len(self.keys) or not len(wanted):
             return np.full(len(wanted), -1)
         if not wanted.shape[1]:

@@ -68,7 +68,7 @@ class Lattice:
                 yield tuple(n if place in pattern else None for place, n in enumerate(binding))
 
     def closed(self, bindings: Iterable[Partial], known: Iterable[Partial] = ()) -> set[Partial]:
-        """Return partial bindings, and the unions of any two of them without a conflict.
+        """Return partial bindings (nodes for some variables), and the unions of any two that do not conflict.
 
         The empty binding is included.
 
@@ -86,14 +86,14 @@ class Lattice:
         return found
 
     def ordered(self, bindings: Iterable[Partial]) -> list[Partial]:
-        """Sort partial bindings by the number of bound variables, fewest first."""
+        """Sort partial bindings (nodes for some variables): those with few variables first."""
         if self.size < 2:
             return sorted(bindings, key=lambda one: one != self.stranger)
         return sorted(bindings, key=lambda one: sum(node is not None for node in one))
 
 
 def _both(one: Partial, other: Partial) -> Partial | None:
-    """Return the union of two partial bindings.
+    """Return the union of two partial bindings (nodes for some variables).
 
     ``None`` means that they have different nodes for a variable.
     """

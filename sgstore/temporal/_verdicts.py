@@ -48,7 +48,7 @@ class TooDeep(Exception):  # noqa: N818 - no error: who asks goes another way
 
 @dataclass(frozen=True, slots=True)
 class PrefixVerdicts:
-    """Truth values of a formula at each frame, for each possible end of the trace.
+    """Truth values of a formula at each frame, for each frame at which the trace could end.
 
     Attributes
     ----------
@@ -62,12 +62,12 @@ class PrefixVerdicts:
     switches: Places
 
     def at(self, ends: Places) -> Bools:
-        """Return the formula's value at each frame, if the trace ends at the frame given for it."""
+        """Return the formula's value at each frame. ``ends``: for each frame, where the trace ends."""
         return self.start ^ (np.sum(self.switches <= ends, axis=0) % 2 == 1)
 
     @property
     def rising(self) -> Places:
-        """For each frame, return the first trace end at which the formula is true; the frame count if none.
+        """For each frame, return the end of the shortest trace that makes the formula true, or the frame count.
 
         Raises
         ------
@@ -82,7 +82,7 @@ class PrefixVerdicts:
 
 
 def prefix_values(formula: Formula, table: PropositionTable) -> Bools:
-    """Return the truth value of a formula at the first frame, for each possible end of the trace.
+    """Return the truth value of a formula at the first frame, for each frame at which the trace could end.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def prefix_values(formula: Formula, table: PropositionTable) -> Bools:
 
 
 def _at_first(formula: Formula, at: int, table: PropositionTable) -> Bools:  # noqa: PLR0911
-    """Return the truth value of a formula at one frame, for each possible end of the trace."""
+    """Return the truth value of a formula at one frame, for each frame at which the trace could end."""
     frames = len(table.times)
     if not looks_ahead(formula):
         return np.full(frames, table.whole(formula)[at])
@@ -117,7 +117,7 @@ def _at_first(formula: Formula, at: int, table: PropositionTable) -> Bools:  # n
 
 
 def _shown(formula: Until, at: int, table: PropositionTable) -> Bools:
-    """Return, for each possible end of the trace, True if an *until* at one frame is fulfilled by then."""
+    """For each frame at which the trace could end, return True if an *until* is fulfilled by then."""
     near, far = table.window(formula.bound, forward=True)
     frames = len(table.times)
     first = at if near is None else int(near[at])
@@ -140,7 +140,7 @@ def _shown(formula: Until, at: int, table: PropositionTable) -> Bools:
 
 
 def _course(formula: Formula, table: PropositionTable) -> PrefixVerdicts:
-    """Return the truth values of a formula at all frames, for each possible end of the trace.
+    """Return the truth values of a formula at all frames, for each frame at which the trace could end.
 
     Raises
     ------
@@ -244,11 +244,11 @@ class Settled:
 
     @cached_property
     def _missed(self) -> Places:
-        """For each frame, when the formula is decided as false, as the trace has ended."""
+        """For each frame, return the frame at which its formula is decided as false, for the complete trace."""
         return known(self.formula, self._table, ended=self._tolerance)[1]
 
     def due(self, start: int, end: str) -> bool:
-        """True if the formula at frame ``start`` counts as open, not as false, after the trace end.
+        """True if the formula at frame ``start`` stays undecided at the trace end, instead of false.
 
         Parameters
         ----------
@@ -291,7 +291,7 @@ class Settled:
         return told
 
     def _stepped(self) -> Bools:
-        """Return the truth value at the first frame, for each possible end of the trace, frame by frame."""
+        """Return the truth value at the first frame, for each frame at which the trace could end, in order."""
         progression = Progression(self.formula)
         names, plain = progression.names, progression.untimed and not progression.past
         end = min(int(self._known[0][0]), int(self._known[1][0]), self._frames - 1) + 1
@@ -329,7 +329,7 @@ class Settled:
         return self.judged(reset, "weak" if weak else "strong")[0]
 
     def judged(self, reset: Bools | None, end: str) -> tuple[list[Violation], bool]:
-        """Return the violations of the formula as ranges of frames, and True if it is open at the trace end.
+        """Return the violations of the formula as ranges of frames; True if it is undecided at the trace end.
 
         Parameters
         ----------

@@ -208,7 +208,7 @@ def exact(value: float) -> int:
 
 
 def rounded(total: int) -> float:
-    """Return the float for an integer: that multiple of the smallest positive float (5e-324)."""
+    """Return a float from its integer: that integer times the smallest positive float (5e-324)."""
     try:
         return total / (1 << _UNIT)
     except OverflowError:

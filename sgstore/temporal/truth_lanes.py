@@ -65,7 +65,7 @@ class TruthLanes:
 
     @property
     def steps(self) -> tuple[int, ...]:
-        """Numbers of the sequence steps that have truth lanes. A single-frame pattern is step 0."""
+        """Numbers of the sequence steps for which frames are stored. A single-frame pattern is step 0."""
         return tuple(dict.fromkeys(lane.part.step for lane in self.lanes))
 
     def together(self, step: int = 0) -> tuple[tuple[int, int], ...]:
