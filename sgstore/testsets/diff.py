@@ -83,7 +83,7 @@ def _listed(values: set[str]) -> str:
 
 
 def scenes(a: Classed, b: Classed) -> ReportTable:
-    """Return a table of scene classes that only one selection has, or whose shares of frames differ.
+    """Return a table of scene classes with different shares of frames in both selections, or in only one.
 
     Parameters
     ----------

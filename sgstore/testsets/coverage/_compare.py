@@ -253,7 +253,7 @@ def novel(a: Classed, than: Classed) -> ReportTable:
 
 
 def novel_frames(a: Classed, than: Classed) -> ReportTable:
-    """Return a table of the frames whose class another selection lacks, the rarest class first.
+    """Return a table of the frames with a class that another selection lacks, the rarest class first.
 
     Returns
     -------
@@ -272,7 +272,7 @@ def novel_frames(a: Classed, than: Classed) -> ReportTable:
 
 
 def novel_clips(a: Classed, than: Classed) -> ReportTable:
-    """Return a table of the clips whose classes another selection lacks, the longest clip first.
+    """Return a table of the clips with classes that another selection lacks, the longest clip first.
 
     Returns
     -------

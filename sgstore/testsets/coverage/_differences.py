@@ -180,7 +180,7 @@ def explain(
 
 
 def _without(a: Classed, b: Classed) -> tuple[Classed, int]:
-    """Remove from a selection the frames of another one. Return the rest, and how many were removed."""
+    """Return a selection without the frames of another one, and the number of removed frames."""
     if a.chosen.place != b.chosen.place:
         return a, 0
     rows = np.flatnonzero(~np.isin(a.frame_id, b.frame_id))

@@ -61,7 +61,7 @@ _RETURN: Final = re.compile(r"\bRETURN\b", re.IGNORECASE)
 
 
 def cells(chosen: ChosenFrames, query: str) -> tuple[tuple[str, ...], dict[tuple[Any, ...], int]]:
-    """Return the columns of a query. For each combination of returned values, return the frame count.
+    """Return the columns of a query, and the frame count of each combination of returned values.
 
     Raises
     ------
@@ -197,7 +197,7 @@ class Slot:
         return (NONE, *self.values) if self.none else (*self.values,)
 
     def block(self, value: str) -> tuple[list[str], list[str]]:
-        """For a value of the slot, return patterns that a frame must match, and those it must not match."""
+        """For a value of the slot (scene parameter), return required patterns, and excluded ones."""
         blocks = {name: block_of(pattern) or "" for name, pattern in self.values.items()}
         return ([], list(blocks.values())) if value == NONE else ([blocks[value]], [])
 
@@ -237,7 +237,7 @@ class Specification:
     def matrix(
         self, chosen: ChosenFrames
     ) -> tuple[list[tuple[str, str]], NDArray[np.int64], Bools]:
-        """Return the values of all slots, frame counts for pairs of values, and a mask of required pairs.
+        """Return all values of the slots (scene parameters), frame counts of pairs, and the possible pairs.
 
         Returns
         -------
@@ -375,7 +375,7 @@ def _slot(path: Path, given: Any) -> Slot:
 
 
 class _Held:
-    """Cache of masks: pattern → mask of the selected frames that match it."""
+    """Cache of masks: query pattern → mask of the selected frames that match it."""
 
     def __init__(self, chosen: ChosenFrames, tables: Mapping[str, Path]) -> None:
         self._chosen = chosen = chosen.joined(tables)
@@ -406,7 +406,7 @@ class _Held:
         return held
 
     def sets(self, specification: Specification) -> tuple[Ints, list[str], Ints]:
-        """Return the counted frames, the names of combinations of slot values, and each frame's combination."""
+        """Return the selected frames, the names of slot value combinations, and each frame's combination."""
         rows = np.flatnonzero(self.of(specification.where))
         names, code = [""], np.zeros(len(rows), np.int64)
         for slot in specification.slots:
@@ -429,7 +429,7 @@ class _Held:
 
 
 def slot_sets(chosen: ChosenFrames, specification: Specification) -> tuple[Ints, list[str], Ints]:
-    """Return frames, names of classes, and class numbers. A class is a combination of slot values.
+    """Return frames, names of classes, and each frame's class: its combination of slot (parameter) values.
 
     Returns
     -------

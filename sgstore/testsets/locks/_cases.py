@@ -92,7 +92,7 @@ def lock_of(
 def _cases(
     parts: Sequence[CasePart], known: Mapping[int, StoredTrace]
 ) -> tuple[Iterator[_Fields], list[Ints]]:
-    """Return test cases without digests, and the frame ids of each; sorted by trace and first frame."""
+    """Return test cases still without digests, and the frame ids of each; sorted by trace and first frame."""
     if not parts:
         return iter(()), []
     ends = np.cumsum([len(frame_id) for frame_id, _, _ in parts])

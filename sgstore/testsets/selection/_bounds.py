@@ -39,7 +39,7 @@ _MEMBERSHIPS: Final = 200_000_000
 
 
 def bounded(family: SetFamily, cover: Ints) -> tuple[float, Ints, Floats]:
-    """Return a lower bound for the cost of any set cover, a cover no more costly than ``cover``, and prices.
+    """Return a lower bound for the cost of any set cover, a cheap cover, and element prices as a proof.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def bounded(family: SetFamily, cover: Ints) -> tuple[float, Ints, Floats]:
 
 
 def _suggested(family: SetFamily, left: Floats) -> Ints:
-    """Return a set cover. It prefers sets whose cost is low compared with the prices of their elements."""
+    """Return a set cover. Sets with a low cost, compared with the prices of their elements, are preferred."""
     order = np.lexsort((family.rank, left / np.maximum(np.diff(family.starts), 1)))
     place = np.empty(len(order), np.int64)
     place[order] = np.arange(len(order))

@@ -54,7 +54,7 @@ ROUNDING = 1 + 1e-12
 
 @dataclass
 class BudgetTracker:
-    """Remaining budget of a selection, and the frames that are already paid.
+    """Remaining budget of a selection, and the frames whose cost is already subtracted from it.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ class BudgetTracker:
         return cls(units, units.costs(measure), weights, nothing, 0.0, most * ROUNDING)
 
     def prices(self, some: Ints) -> Floats:
-        """Return the price of each given selection unit: the cost of its frames that are not paid yet."""
+        """Return the price of each given selection unit: the cost of those frames that are not paid yet."""
         if self.weights is None:
             return self.cost[some]
         begin, end = self.units.begin[some].tolist(), self.units.end[some].tolist()
@@ -346,7 +346,7 @@ _COARSER: Final = ("EL", "ER", "E")
 
 
 def _saves_nothing(spec: SelectionSpec, units: Units) -> str:
-    """Return a note: the minimal selection needs every unit. The note names a setting that needs fewer."""
+    """Return a note for a minimal selection that needs all units. It names a setting that needs fewer."""
     said = f"--minimal saves nothing: each of the {len(units)} {spec.unit}s has an item of its own"
     if spec.sequences:
         return said

@@ -77,7 +77,7 @@ def cheapest_alike(family: SetFamily) -> Bools:
 
 
 def _force(family: SetFamily, need: Ints, alive: Bools, forced: Bools) -> None:
-    """If an element needs all sets that contain it, select these sets."""
+    """Select all sets that contain an element, if their number does not exceed the need of the element."""
     while True:
         rows = alive[family.set_of]
         often = np.bincount(family.members[rows], minlength=len(need))
@@ -92,7 +92,7 @@ def _force(family: SetFamily, need: Ints, alive: Bools, forced: Bools) -> None:
 
 
 def _drop_same_elements(family: SetFamily, need: Ints, alive: Bools, wanted: Bools) -> None:
-    """If several elements are in exactly the same sets, keep only the one with the greatest need."""
+    """If several elements are in exactly the same sets, keep only the one that needs the most sets."""
     rows = alive[family.set_of] & wanted[family.members]
     key = _keys(family.members[rows], family.set_of[rows], len(need), len(family))
     elements = np.flatnonzero(wanted)
@@ -130,7 +130,7 @@ def _repeated(*keys: Ints) -> Bools:
 def _drop_larger_elements(
     family: SetFamily, need: Ints, alive: Bools, wanted: Bools, most: int
 ) -> int:
-    """Remove an element if each cover of another element also covers it. Return the number of steps."""
+    """Remove each element that any cover of another element also covers. Return the number of steps."""
     rows = alive[family.set_of] & wanted[family.members]
 
     def superfluous(small: Ints, large: Ints) -> Ints:
@@ -144,7 +144,7 @@ def _drop_larger_elements(
 
 
 def _drop_smaller_sets(family: SetFamily, alive: Bools, wanted: Bools, most: int) -> int:
-    """Remove a set if a set that costs no more contains it. Return the number of steps."""
+    """Remove each set whose elements are all in another set that costs no more. Return the number of steps."""
     rows = alive[family.set_of] & wanted[family.members]
 
     def superfluous(small: Ints, large: Ints) -> Ints:
@@ -165,7 +165,7 @@ def _contained(
     superfluous: Callable[[Ints, Ints], Ints],
     most: int,
 ) -> tuple[Bools, int]:
-    """Test which items contain others. Return a mask of redundant items, and the number of steps.
+    """Test which items (sets or elements) contain others. Return a mask of redundant items, and the step count.
 
     Parameters
     ----------
@@ -209,7 +209,7 @@ def _contained(
 def _compared(
     one: Ints, other: Ints, sizes: tuple[int, int], done: Bools, batch: int
 ) -> tuple[Ints, tuple[Ints, Ints]]:
-    """Return the next items to compare, smallest first, and the items that may contain them.
+    """Return the next items (sets or elements) to compare, smallest first, and possible containers of them.
 
     A containing item has all components of the item, also its first, which is the rarest.
     """
@@ -420,7 +420,7 @@ def _at_most(family: SetFamily, chosen: Ints, budget: float) -> float:
 
 @dataclass(frozen=True)
 class UnitPieces:
-    """Clips as ranges of pieces. Overlapping clips share pieces. The cost of a shared piece counts once.
+    """Clips, divided into pieces at every start and end. The cost of a piece in several clips counts once.
 
     Attributes
     ----------
@@ -505,7 +505,7 @@ def _greedy(family: SetFamily, spans: UnitPieces, budget: float = math.inf) -> I
 
 
 def _thinned(family: SetFamily, spans: UnitPieces, chosen: Ints) -> Ints:
-    """Return the selected clips without redundant ones. The most expensive redundant clip goes first."""
+    """Return the selected clips without redundant ones. The most expensive redundant clip is removed first."""
     times = np.zeros(len(spans.cost) + 1, np.int64)
     np.add.at(times, spans.begin[chosen], 1)
     np.add.at(times, spans.end[chosen], -1)

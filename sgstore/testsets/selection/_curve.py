@@ -105,7 +105,7 @@ def curve(selection: Selection, points: int = POINTS) -> Curve:
 
 
 def _of_all_units(selection: Selection) -> Selection:
-    """Return the selection with all units. A collection first returns only units that a selection may need."""
+    """Return the selection with all units. In a collection, at first it has only units worth selecting."""
     spec, some = selection.spec, selection.units
     units = units_of(some.chosen, spec.unit, spec.clip_s, spec.stride_s)
     picked = np.searchsorted(units.first, some.first[selection.picked])

@@ -204,7 +204,7 @@ _STEPS: Final = 50
 
 
 def _ranked(x: Singles, columns: Sequence[Singles]) -> Floats:
-    """Return a column of ones, and for each feature its rank (−½ … ½) and a flag for known values."""
+    """Return a column of ones; and for each feature, its rank (−½ … ½), and 1 if its value is known."""
     parts = [np.ones(len(x))]
     for values, known in zip(x.T, columns, strict=True):
         there = ~np.isnan(values)

@@ -142,7 +142,7 @@ class _EgoPairs:
 
     @classmethod
     def read(cls, file: StoreFile, frames: Ints) -> _EgoPairs:
-        """Read the pairs of frames with ascending ids. Only pairs in uneven traces can have marks."""
+        """Read the pairs of frames with ascending ids. Marks are computed only in traces with special pairs."""
         pairs = cls._read(file, frames, _STATES)
         uneven = cls._read(file, frames, _MARKED)
         if len(uneven):
@@ -191,7 +191,7 @@ class _EgoPairs:
 
 
 def _bounds(pairs: PairNumbers, measures: Sequence[str]) -> tuple[list[Floats], Bools]:
-    """Return lower bounds for measures of pairs, and a mask of the pairs whose gap is unknown."""
+    """Return lower bounds for the measures of pairs, and a mask of the pairs whose gap is unknown."""
     apart = np.maximum(pairs["at_least"], 0) * _SLACK
     unknown = np.isnan(apart + pairs["ca"] + pairs["cb"])
     closing = np.nan_to_num(pairs["closing_speed"])
@@ -214,7 +214,7 @@ def _least(frame: Ints, values: Floats, count: int) -> Floats:
 
 
 def _first(frame: Ints, bound: Floats, count: int) -> Ints:
-    """For each frame, return one row with the lowest bound. Frames without a finite bound are left out."""
+    """For each frame, return the row with the lowest bound. Frames without a finite bound are left out."""
     rows = np.flatnonzero((bound == _least(frame, bound, count)[frame]) & (bound < np.inf))
     first = np.full(count, -1)
     first[frame[rows]] = rows

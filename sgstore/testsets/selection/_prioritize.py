@@ -418,7 +418,7 @@ def _lacking(spec: PrioritySpec, units: Units, worst: Sequence[WorstValues]) -> 
 
 
 def _places(total: Floats, rank: Ints) -> Ints:
-    """Return the place of each value in ascending order, (U,), from 0. For equal values, ``rank`` decides."""
+    """Return the position of each value in ascending order, (U,), from 0. ``rank`` decides between equals."""
     found = np.empty(len(total), np.int64)
     found[np.lexsort((rank, total))] = np.arange(len(total))
     return found
@@ -529,7 +529,7 @@ def _worst_of_pairs(
 
 
 def _worst_within_bounds(units: Units, measures: Sequence[str]) -> tuple[Floats, Ints, int]:
-    """Return the same as :func:`_worst_of_all_pairs`, without measures of all pairs."""
+    """For each measure and frame, return the worst value and its entity. Compute only promising pairs."""
     value = np.full((len(measures), len(units.frame_id)), np.inf)
     other = np.full(value.shape, -1)
     blind = 0

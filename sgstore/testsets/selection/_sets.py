@@ -109,7 +109,7 @@ class SetFamily:
         return starts, self.set_of[order]
 
     def gains(self, open_: Bools) -> Floats:
-        """For each set, return the total weight of its elements that are still needed, (S,)."""
+        """For each set, return the total weight of those elements that are not covered enough yet, (S,)."""
         rows = open_[self.members]
         weight = self.weight[self.members[rows]].astype(np.float64)
         return np.bincount(self.set_of[rows], weight, len(self)).astype(np.float64)
@@ -229,12 +229,12 @@ def ordered(family: SetFamily, chosen: Ints) -> Ints:
 
 
 def met(family: SetFamily, chosen: Ints) -> int:
-    """Return how much of the need of all elements the selected sets meet, as a sum of weights."""
+    """Return the total weight of covered elements. If an element needs several sets, each of them counts."""
     return int((np.minimum(family.covered(chosen), family.need) * family.weight).sum())
 
 
 def or_alone(family: SetFamily, chosen: Ints, budget: float) -> Ints:
-    """Return the selected sets; or a single set within the budget, if it covers more than they do."""
+    """Return the selected sets; or a single set within the budget, if this set covers more."""
     gain = family.gains(family.need > 0)
     single = np.flatnonzero(family.cost <= budget)
     best = single[np.lexsort((family.rank[single], -gain[single]))[:1]]

@@ -137,7 +137,7 @@ class Units:
 
     @property
     def total(self) -> int:
-        """Return the number of all units. In a collection, bundles may not have returned all of them."""
+        """Return the number of all units. The bundles of a collection may return only their cheapest units."""
         return len(self) + self.others
 
     @property
@@ -335,7 +335,7 @@ def _clips(frames: Units, time_ns: Ints, clip_s: float, stride_s: float) -> tupl
 
 @dataclass(frozen=True)
 class Holdings:
-    """Elements of each selection unit: scene classes, feature combinations or sequences.
+    """Elements of each selection unit: its scene classes, feature combinations or manoeuvre sequences.
 
     Attributes
     ----------
@@ -372,7 +372,7 @@ class Holdings:
         return replace(found, weight=self.weight)
 
     def over(self, units: Units) -> Holdings:
-        """Return the elements of other clips with the same frames.
+        """Return the same kind of elements for other clips, which have the same frames.
 
         Raises
         ------
