@@ -45,9 +45,6 @@ JUMP_NS: Final = 86_400_000_000_000
 AT_ZERO_NS: Final = 100_000_000
 """Largest expected time at which a stamp of 0 in another channel is accepted as a real time; ns."""
 
-OTHER_CLOCK_NS: Final = 86_400_000_000_000
-"""Smallest difference between the stamps of two different clocks; ns."""
-
 TOLERANCE_NS: Final = 1_000
 """Smallest time tolerance for equality; ns."""
 

@@ -17,10 +17,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Final
 
-from sgstore.model.world import AT_ZERO_NS, OTHER_CLOCK_NS
+from sgstore.model.world import AT_ZERO_NS
 
 NEAR: Final = 1_000_000_000
 """Time up to which a stamp counts as near 0, or three periods of its channel if that is longer; ns."""
+OTHER_CLOCK: Final = 86_400_000_000_000
+"""Smallest difference between the stamps of two different clocks; ns."""
 MOST_RUNS: Final = 100_000
 """Largest number of stored groups of messages without a stamp. Messages of further groups are lost."""
 LATEST_NS: Final = 1 << 62
@@ -160,7 +162,7 @@ class StampReader:
             return log_time_ns
         if stamp_ns == 0 and not self._stamps.explicit:
             return 0 if abs(expected) <= AT_ZERO_NS else expected
-        same_clock = stamp_ns is not None and abs(stamp_ns - expected) < OTHER_CLOCK_NS
+        same_clock = stamp_ns is not None and abs(stamp_ns - expected) < OTHER_CLOCK
         return stamp_ns if stamp_ns is not None and same_clock else expected
 
     def _unstamped(self, log_time_ns: int, stamp_ns: int | None) -> int | None:

@@ -34,7 +34,7 @@ from sgstore.lang.topics import (
 )
 from sgstore.mcap import Findings, mark_of
 from sgstore.model.frame_ids import SEQ_BITS
-from sgstore.model.world import AT_ZERO_NS, OTHER_CLOCK_NS, TOLERANCE_NS
+from sgstore.model.world import AT_ZERO_NS, TOLERANCE_NS
 from sgstore.store._joins import tables_folder
 from sgstore.store._locking import default_memory, shut_in
 from sgstore.store._schema import INSIDE
@@ -390,6 +390,8 @@ _STAMPS: Final = (
 """Fields with the time stamp of a message: seconds and nanoseconds."""
 _AHEAD_NS: Final = 1_000_000_000
 """Largest time by which a usable stamp is later than the message's log time, by the clock of the frames; ns."""
+_BEHIND_NS: Final = 60_000_000_000
+"""Largest time by which a usable stamp is earlier; ns. Beyond it, the stamp is of another clock."""
 
 
 def stamp_text(fields: Mapping[str, str]) -> str:
@@ -401,12 +403,9 @@ def stamp_text(fields: Mapping[str, str]) -> str:
     for pair in _STAMPS:
         if all(fields.get(name) in WHOLE for name in pair):
             sec, nano = (f"CAST({quoted(name)} AS HUGEINT)" for name in pair)
-            stamp, late = (
-                f"({sec} * 1000000000 + {nano})",
-                f'{sec} * 1000000000 + {nano} - ":time_ns"',
-            )
+            stamp = f"({sec} * 1000000000 + {nano})"
             usable = (
-                f"{late} BETWEEN {1 - OTHER_CLOCK_NS} AND {_AHEAD_NS}"
+                f'{stamp} - ":time_ns" BETWEEN {-_BEHIND_NS} AND {_AHEAD_NS}'
                 f' AND ({stamp} <> 0 OR abs(":time_ns") <= {AT_ZERO_NS})'
             )
             return f"CASE WHEN {usable} THEN CAST({stamp} AS BIGINT) END"

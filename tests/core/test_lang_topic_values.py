@@ -332,14 +332,15 @@ def test_a_message_belongs_to_the_frame_of_its_stamp(tmp_path: Path) -> None:
     with Recorder(tmp_path / "drive.mcap") as recorder:
         channel = recorder.channel("/planner", "Planner", SCHEMA)
         for frame in range(5):
-            log, ns = 100 + frame / 10, 3_000_000_000 + frame * 100_000_000 - frame % 2
-            recorder.ground_truth(log, [car(1, x=frame)], host=1, stamp=3 + frame / 10)
+            log, ns = 100 + frame / 10, 9_003_000_000_000 + frame * 100_000_000 - frame % 2
+            recorder.ground_truth(log, [car(1, x=frame)], host=1, stamp=9003 + frame / 10)
             stamp = {"sec": ns // 10**9, "nanosec": ns % 10**9}
             late = {"z": frame, "header": {"stamp": stamp}}
             recorder.write(channel, log + 0.001, json.dumps(late).encode())
-            other = {"z": frame, "header": {"stamp": {"sec": 10**9, "nanosec": 0}}}
-            wall = recorder.channel("/wall_clock", "Planner", SCHEMA)
-            recorder.write(wall, log + 0.001, json.dumps(other).encode())
+            for name, sec in (("/wall_clock", 10**9), ("/two_hours_behind", ns // 10**9 - 7200)):
+                other = {"z": frame, "header": {"stamp": {"sec": sec, "nanosec": ns % 10**9}}}
+                clock = recorder.channel(name, "Planner", SCHEMA)
+                recorder.write(clock, log + 0.001, json.dumps(other).encode())
     store = sgstore.open(tmp_path / "s.sgstore", create=True)
     store.ingest(tmp_path / "drive.mcap")
     rules = ("", ", nearest", ", linear")
@@ -347,7 +348,8 @@ def test_a_message_belongs_to_the_frame_of_its_stamp(tmp_path: Path) -> None:
     rows = store.find(f"MATCH (e:Ego) RETURN {text} ORDER BY frame.seq").rows()
     values = [[row[number] for number in range(3)] for row in rows]
     assert values == [pytest.approx([frame] * 3) for frame in range(5)]
-    rows = store.find("MATCH (e:Ego) RETURN topic('/wall_clock').z ORDER BY frame.seq").rows()
-    assert [row[0] for row in rows] == [None, 0, 1, 2, 3]  # another clock: by log time
+    for name in ("/wall_clock", "/two_hours_behind"):  # another clock: by log time
+        rows = store.find(f"MATCH (e:Ego) RETURN topic('{name}').z ORDER BY frame.seq").rows()
+        assert [row[0] for row in rows] == [None, 0, 1, 2, 3]
     rows = store.sql("SELECT t FROM topic('/planner')")
     assert [row[0] for row in rows] == pytest.approx([frame / 10 for frame in range(5)])
