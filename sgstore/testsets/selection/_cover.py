@@ -232,7 +232,7 @@ def _compared(
 def _holding(
     key: Ints, sizes: tuple[int, int], pairs: tuple[Ints, Ints], most: int
 ) -> tuple[Ints, Ints, int]:
-    """Return the pairs in which the second item contains the first, and the number of steps.
+    """Return the pairs of items (sets or elements) in which the second contains the first; the step count.
 
     All pairs share the first component. Pairs that are undecided within the limit are excluded.
     """
