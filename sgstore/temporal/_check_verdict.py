@@ -144,7 +144,7 @@ class Verdict:
     applied_frames : int or None
         For a ``true`` verdict of ``ALWAYS (p IMPLIES q)``: number of frames in which p is true, for some
         entities. Without ``IMPLIES``: the same for the ``WHERE`` of ``FORALL``. Otherwise ``None``, also in
-        monitors.
+        monitors, and if p is about too many combinations of entities.
     bindings : int or None
         For a ``true`` verdict of a ``FORALL``: number of combinations of its entities, without its
         ``WHERE``. Otherwise ``None``, also in monitors.

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from sgstore.base.display import IN_NOTEBOOK
-from sgstore.lang.bind import negated, not_computed, of_check
+from sgstore.errors import QueryError
+from sgstore.lang.bind import not_computed, of_check
 from sgstore.lang.help import compared_in_check
-from sgstore.lang.ir import Tense
 from sgstore.lang.library import statement
 from sgstore.lang.sql import compile_checks, entities, relation, traces_of
 from sgstore.matches import Interval, notes_in
@@ -62,9 +62,9 @@ from sgstore.temporal._offline import PlanValues, Premises, frame_times, traces
 from sgstore.temporal._plan import (
     kept_throughout,
     needs_text,
+    never_applies,
     plan_of_returned,
     plan_text,
-    premise_of,
 )
 from sgstore.temporal._premises import bindings_of, premises_of
 from sgstore.temporal._quantifiers import (
@@ -587,16 +587,19 @@ class StoreCheck:
 
     @cached_property
     def _applied(self) -> dict[int, int]:
-        """Return the number of frames in which the premise is true: trace id → frame count."""
-        premise = premise_of(self._check)
-        if premise is None:
+        """Return the number of frames in which the premise is true: trace id → frame count.
+
+        The result is empty without a premise, and if a trace has too many combinations for its premise.
+        """
+        never = never_applies(self._check)
+        if never is None:
             return {}
-        never = Tense("ALWAYS", (negated(premise),))
-        plain: dict[str, Any] = {"reset": None, "robustness": False, "returns": (), "having": None}
-        check = replace(self._check, formula=never, gaps="break", **plain)
-        inner = StoreCheck(self._file, replace(self._bound, check=check))
-        readers = inner.readers(premises=inner._premises)
-        return {trace.trace_id: inner._false_frames(trace) for trace in readers}
+        inner = StoreCheck(self._file, replace(self._bound, check=never))
+        try:
+            readers = inner.readers(premises=inner._premises)
+            return {trace.trace_id: inner._false_frames(trace) for trace in readers}
+        except QueryError:  # the check itself needs fewer combinations
+            return {}
 
     def _false_frames(self, trace: TraceReader) -> int:
         """Return the number of frames in which a check ``ALWAYS p`` has a false p, for some entities."""

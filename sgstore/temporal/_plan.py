@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING, Final
 import sgstore.temporal._formula as f
 from sgstore.errors import QueryError
 from sgstore.lang import ir as b
-from sgstore.lang.bind import CONNECTIVES
+from sgstore.lang.bind import CONNECTIVES, negated
 from sgstore.lang.catalog import Type
 from sgstore.lang.sql import relation, unnumbered_text, value_text
 from sgstore.temporal._formula import formula_text
@@ -395,6 +395,35 @@ def kept_throughout(check: b.BoundCheck) -> b.Bound | None:
 
     every = all(one.word == "FORALL" for one in check.quantifiers)
     return lasting(check.formula) if every else None
+
+
+def never_applies(check: b.BoundCheck) -> b.BoundCheck | None:
+    """Return the check that the premise of another check is never true; None without a premise.
+
+    It has only the variables of the premise, and those with a ``WHERE``.
+    """
+    premise = premise_of(check)
+    if premise is None:
+        return None
+    unused = {n for q in check.quantifiers if q.where is None for n in q.nodes} - b.nodes_of(
+        premise
+    )
+    left = ((q, tuple(n for n in q.nodes if n not in unused)) for q in check.quantifiers)
+    return replace(
+        check,
+        scope=replace(
+            check.scope,
+            nodes={key: one for key, one in check.scope.nodes.items() if key not in unused},
+            distinct=frozenset(pair for pair in check.scope.distinct if not unused & {*pair}),
+        ),
+        quantifiers=tuple(replace(q, nodes=nodes) for q, nodes in left if nodes),
+        formula=b.Tense("ALWAYS", (negated(premise),)),
+        reset=None,
+        gaps="break",
+        robustness=False,
+        returns=(),
+        having=None,
+    )
 
 
 def premise_of(check: b.BoundCheck) -> b.Bound | None:

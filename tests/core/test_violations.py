@@ -18,6 +18,7 @@ from thorough import LONG
 import sgstore
 from sgstore.apps.cli import run
 from sgstore.ingest import ingest
+from sgstore.temporal import _offline
 from sgstore.temporal._formula import always
 from sgstore.temporal._quantifiers import number_of_bindings
 from sgstore.temporal._verdicts import Settled
@@ -234,6 +235,8 @@ def test_random_conditions_are_false_where_the_textbook_says(first: int) -> None
         ("FORALL (v:Car) ALWAYS dist(ego, v) > 1", None, 2),
         ("FORALL (v:Car) ALWAYS (v.speed > 10 IMPLIES dist(ego, v) > 1)", 5, 2),
         ("FORALL (p:Person) ALWAYS gap(ego, p) > 1", None, 0),
+        ("FORALL (v:Car, w:Car) ALWAYS (v.speed > 10 IMPLIES dist(v, w) > 1)", 8, 6),
+        ("FORALL (v:Car, w:Car WHERE w.speed > 90) ALWAYS (v.speed > 10 IMPLIES v.x < 99)", 0, 6),
         ("ALWAYS ego.speed < 20", None, None),
         ("FORSOME (v:Car) ALWAYS v.speed < 20", None, None),
     ],
@@ -246,6 +249,21 @@ def test_a_true_verdict_tells_how_often_the_check_applied(
     assert verdict.verdict == "true"
     assert (verdict.applied_frames, verdict.bindings) == (applied, bindings)
     assert bool(verdict.never_applied) == (0 in {applied, bindings})
+
+
+@pytest.mark.parametrize(
+    ("premise", "applied"), [("v.speed > 10", 8), ("v.speed > 7 OR w.speed > 7", None)]
+)
+def test_a_premise_refuses_no_check(
+    applying: Store, monkeypatch: pytest.MonkeyPatch, premise: str, applied: int | None
+) -> None:
+    monkeypatch.setattr(_offline, "MOST_BINDINGS", 4)
+
+    (verdict,) = applying.check(
+        f"CHECK FORALL (v:Car, w:Car) ALWAYS ({premise} IMPLIES dist(v, w) > 1)"
+    )
+
+    assert (verdict.verdict, verdict.applied_frames, verdict.bindings) == ("true", applied, 6)
 
 
 def test_a_false_verdict_has_no_count(applying: Store) -> None:
