@@ -256,8 +256,8 @@ def within_range(found: Verdict, short: ShortRange) -> Verdict:
     if not reason:
         return found
     nothing = {"violations": (), "witnesses": (), "absent_frames": 0}
-    nothing |= {"applied_frames": None, "bindings": None}
-    return replace(found, verdict="unknown", reason=reason, **nothing)
+    counts = {"applied_frames": None, "bindings": None}
+    return replace(found, verdict="unknown", reason=reason, **nothing, **counts)
 
 
 def verdict_columns(*, margin: bool = False, returned: Sequence[str] = ()) -> tuple[str, ...]:

@@ -182,7 +182,7 @@ def number_of_bindings(domains: Sequence[Collection[int]], *, injective: bool) -
     """
     if not injective:
         return prod(map(len, domains))
-    kinds = Counter(tuple(one in some for some in domains) for one in set().union(*domains))
+    kinds = Counter(tuple(one in some for some in domains) for one in set[int]().union(*domains))
 
     def combined(at: int) -> int:
         total = 0
