@@ -219,6 +219,7 @@ class StoreVerbs:
         combos: int = 0,
         of_ego: bool = False,
         sequences: int = 0,
+        classes: bool = False,
         manoeuvres: Sequence[str] = (),
         within: str | float = "10s",
         objective: Literal["units", "frames", "seconds", "bytes"] = "units",
@@ -258,6 +259,8 @@ class StoreVerbs:
             Use only features of the ego and of its lanes.
         sequences : int
             Keep sequences of K manoeuvres.
+        classes : bool
+            Also keep classes of scenes, with --combos or --sequences.
         manoeuvres : sequence of str
             A manoeuvre of sequences: a pattern of the library, or NAME=QUERY; may be repeated.
         within : str or float

@@ -15,6 +15,8 @@ from sgstore.apps.cli import run
 from sgstore.errors import ConfigError, QueryNameError
 from sgstore.testsets.coverage import (
     ChosenFrames,
+    classed,
+    features,
     happenings,
     manoeuvres_named,
     sequences,
@@ -170,10 +172,42 @@ def test_no_fewer_clips_keep_all_sequences(drives: Store) -> None:
     assert found.result["elements"] == len(every)
 
 
+@pytest.mark.parametrize("abstraction", ["E", "RSV"])
+@pytest.mark.parametrize("combos", [0, 1])
+def test_no_fewer_clips_keep_all_classes_and_all_manoeuvres(
+    drives: Store, abstraction: str, combos: int
+) -> None:
+    both = {"classes": True, "combos": combos, "sequences": 1, "manoeuvres": (*THREE,)}
+    spec = SelectionSpec(Strategy.minimal, SelectionUnit.clip, 2.0, abstraction, **both)
+    chosen = ChosenFrames("all", drives)
+
+    found = select(chosen, spec)
+    alone = select(chosen, SelectionSpec(Strategy.minimal, SelectionUnit.clip, 2.0, abstraction))
+
+    held: list[set[str]] = []
+    units = found.units
+    for begin, end in zip(units.begin.tolist(), units.end.tolist(), strict=True):
+        part = ChosenFrames("part", drives, units.frame_id[begin:end])
+        of = classed(part, abstraction)
+        held.append({row[0] for row in sequences(part, 1, None, THREE).covered.rows})
+        held[-1] |= {of.names[code] for code in of.code.tolist()}
+        held[-1] |= {str(one) for one in features(of, abstraction).names} if combos else set()
+    every = set().union(*held)
+    sizes = range(len(held) + 1)
+    covers = (c for n in sizes for c in itertools.combinations(held, n) if set().union(*c) == every)
+    assert len(found.picked) == len(next(covers))
+    assert set().union(*(held[i] for i in found.picked.tolist())) == every
+    assert found.result["elements"] == len(every)
+    assert found.result["kind"].endswith(" and manoeuvres")
+    assert not any("a manoeuvre can be lost" in text for text in found.said)
+    assert any("a manoeuvre can be lost; keep" in text for text in alone.said)
+    assert spec.as_dict("")["classes"] is True
+    assert spec.as_dict("")["abstraction"] == abstraction
+
+
 @pytest.mark.parametrize(
     "more",
     [
-        {"combos": 2, "sequences": 2},
         {"sequences": 2, "unit": SelectionUnit.frame},
         {"manoeuvres": ("stops",)},
         {"within_s": 3.0},

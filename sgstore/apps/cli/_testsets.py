@@ -76,6 +76,7 @@ class ChoiceOptions:
     combos: Annotated[int, Option(min=0)] = 0
     of_ego: bool = False
     sequences: Annotated[int, Option(min=0)] = 0
+    classes: bool = False
     manoeuvres: Manoeuvres = None
     within: Within = "10s"
     objective: Objective = "units"

@@ -9,6 +9,7 @@ import hashlib
 import math
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from functools import reduce
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -31,6 +32,7 @@ from sgstore.testsets.selection._cover import affordable, cheapest, minimal, wit
 from sgstore.testsets.selection._unit_values import is_check, least_margins, least_values
 from sgstore.testsets.selection._units import (
     Budget,
+    Holdings,
     Measure,
     SelectionUnit,
     holdings,
@@ -45,7 +47,7 @@ if TYPE_CHECKING:
     from sgstore.model.world import Bools, Floats, Ints
     from sgstore.testsets.coverage import ChosenFrames
     from sgstore.testsets.locks import Lock
-    from sgstore.testsets.selection._units import Holdings, Units
+    from sgstore.testsets.selection._units import Units
 
 
 ROUNDING = 1 + 1e-12
@@ -151,6 +153,8 @@ class SelectionSpec:
         True if only features of the ego, and of lanes relative to it, count.
     sequences : int
         k: the elements are sequences of k manoeuvres instead of classes; 0: no sequences.
+    classes : bool
+        True if the elements are also classes, with ``combos`` or ``sequences``.
     manoeuvres : tuple of str
         As in :func:`sgstore.testsets.coverage.manoeuvres_named`; by default those of the library.
     within_s : float
@@ -186,6 +190,7 @@ class SelectionSpec:
     seed: int = 0
     stride_s: float | None = None
     sequences: int = 0
+    classes: bool = False
     manoeuvres: tuple[str, ...] = ()
     within_s: float = WITHIN_S
 
@@ -207,10 +212,6 @@ class SelectionSpec:
                 "clips that overlap share frames, so a class that is in two of them may have come once:"
                 " to have each class several times, leave out --stride"
             )
-        if self.sequences and self.combos:
-            raise ConfigError(
-                "use only one of --combos and --sequences to define the items to keep"
-            )
         if self.sequences and self.unit is SelectionUnit.frame:
             raise ConfigError("a sequence needs several frames; add --unit clip or --unit trace")
         if (self.manoeuvres or self.within_s != WITHIN_S) and not self.sequences:
@@ -221,6 +222,11 @@ class SelectionSpec:
             raise ConfigError(
                 f"--alpha {self.alpha:g}; expected 0 (the same for all) to 1 (as they are)"
             )
+
+    @property
+    def scenes(self) -> bool:
+        """True if the elements are classes or combinations of features, perhaps with sequences."""
+        return bool(self.classes or self.combos or not self.sequences)
 
     @property
     def one_of_alike(self) -> bool:
@@ -245,22 +251,29 @@ class SelectionSpec:
             "manoeuvres": list(self.manoeuvres) or None,
             "within_s": self.within_s,
         }
-        return (told if self.sequences and cover else {}) | {
-            "query": query or None,
-            "way": self.strategy.value,
-            "unit": self.unit.value,
-            "clip_s": self.clip_s if self.unit is SelectionUnit.clip else None,
-            "stride_s": self.stride_s if self.unit is SelectionUnit.clip else None,
-            "abstraction": self.abstraction if cover and not self.sequences else None,
-            "combos": self.combos if cover else None,
-            "of_ego": self.of_ego if cover and self.combos else None,
-            "each": self.each if self.strategy in {Strategy.per_class, Strategy.stratify} else None,
-            "by": self.by or None,
-            "temper": self.alpha if self.strategy is Strategy.stratify else None,
-            "budget": None if self.budget is None else str(self.budget),
-            "least": self.objective if cover else None,
-            "seed": self.seed,
-        }
+        both = {"classes": True} if self.classes and cover else {}
+        return (
+            (told if self.sequences and cover else {})
+            | both
+            | {
+                "query": query or None,
+                "way": self.strategy.value,
+                "unit": self.unit.value,
+                "clip_s": self.clip_s if self.unit is SelectionUnit.clip else None,
+                "stride_s": self.stride_s if self.unit is SelectionUnit.clip else None,
+                "abstraction": self.abstraction if cover and self.scenes else None,
+                "combos": self.combos if cover else None,
+                "of_ego": self.of_ego if cover and self.combos else None,
+                "each": self.each
+                if self.strategy in {Strategy.per_class, Strategy.stratify}
+                else None,
+                "by": self.by or None,
+                "temper": self.alpha if self.strategy is Strategy.stratify else None,
+                "budget": None if self.budget is None else str(self.budget),
+                "least": self.objective if cover else None,
+                "seed": self.seed,
+            }
+        )
 
 
 @dataclass(frozen=True)
@@ -374,10 +387,15 @@ def _selected(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
 
 
 def holdings_of(spec: SelectionSpec, units: Units) -> Holdings:
-    """For each unit, return its scene classes, feature combinations or manoeuvre sequences."""
+    """For each unit, return its scene classes, feature combinations and manoeuvre sequences."""
+    found: list[Holdings] = []
+    if spec.classes or not (spec.combos or spec.sequences):
+        found.append(holdings(units, spec.abstraction))
+    if spec.combos:
+        found.append(holdings(units, spec.abstraction, spec.combos, of_ego=spec.of_ego))
     if spec.sequences:
-        return sequence_holdings(units, spec.sequences, spec.manoeuvres, spec.within_s)
-    return holdings(units, spec.abstraction, spec.combos, of_ego=spec.of_ego)
+        found.append(sequence_holdings(units, spec.sequences, spec.manoeuvres, spec.within_s))
+    return reduce(Holdings.joined, found)
 
 
 def _every(spec: SelectionSpec, units: Units, rank: Ints) -> Selection:
@@ -413,6 +431,12 @@ def _covering(spec: SelectionSpec, units: Units, rank: Ints, held: Holdings) -> 
         )
         + f" (greedy choice alone: {_number(cover.greedy)})",
     ]
+    if spec.strategy is Strategy.minimal and not spec.sequences:
+        clips = " --unit clip" if spec.unit is SelectionUnit.frame else ""
+        said.append(
+            f"{held.kind} are of single frames: a manoeuvre can be lost; keep each one with"
+            f"{clips} --sequences 1 --classes"
+        )
     if not (cover.exact or has_solver()):
         said.append("a solver could prove the optimum: pip install 'sgstore[solver]'")
     budget = spec.budget

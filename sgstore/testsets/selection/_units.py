@@ -340,7 +340,7 @@ class Holdings:
     Attributes
     ----------
     classed : Classed or None
-        The frames with their classes; ``None`` for sequences, and for elements from bundles.
+        The frames with their classes; ``None`` with sequences, and for elements from bundles.
     pairs : (2, M) int64
         Units with their elements; each pair once, in order.
     weight : (E,) int64
@@ -370,6 +370,19 @@ class Holdings:
         """Return a set family for set covers: each clip or trace is the set of its scene classes."""
         found = SetFamily.of(self.pairs, len(units), len(self.frames), cost, need, rank)
         return replace(found, weight=self.weight)
+
+    def joined(self, other: Holdings) -> Holdings:
+        """Return the elements of both: a selection then keeps, for example, classes and sequences."""
+        pairs = np.concatenate(
+            [self.pairs, other.pairs + np.array([[0], [len(self.weight)]])], axis=1
+        )
+        return Holdings(
+            None,
+            pairs[:, np.lexsort(pairs[::-1])],
+            np.concatenate([self.weight, other.weight]),
+            np.concatenate([self.frames, other.frames]),
+            f"{self.kind} and {other.kind}",
+        )
 
     def over(self, units: Units) -> Holdings:
         """Return the same kind of elements for other clips, which have the same frames.
@@ -456,7 +469,7 @@ def sequence_holdings(units: Units, k: int, names: Sequence[str], within_s: floa
         parts.append(np.stack([np.full(len(held), unit), np.array(held, np.int64)]))
     pairs = np.concatenate(parts, axis=1)
     often = np.bincount(pairs[1], minlength=len(number)).astype(np.int64)
-    kind = f"sequences of {k} manoeuvres within {within_s:g} s"
+    kind = f"sequences of {k} manoeuvres within {within_s:g} s" if k > 1 else "manoeuvres"
     return Holdings(None, pairs, np.ones_like(often), often, kind)
 
 
