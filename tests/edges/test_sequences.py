@@ -100,6 +100,20 @@ def test_what_happens_is_told_by_who_does_it_and_when(drives: Store) -> None:
     )
 
 
+def test_a_manoeuvre_late_in_a_recording_has_the_id_of_its_frame(tmp_path: Path) -> None:
+    late = ego(along(-1.75), [(0, 5), (19, 5), (20, 0), (24, 0)])
+    store = store_of(tmp_path / "s.sgstore", {"late": [Scene(ROAD, late, seconds=24)]})
+    stops = {"stops": THREE["stops"]}
+    (interval,) = store.find(stops["stops"]).intervals()
+
+    found = happenings(ChosenFrames("all", store), stops)
+    frame = store.file.frame(f"late#{interval.end_seq}").frame_id
+
+    assert interval.start_seq > 64
+    assert found.frame_id.tolist() == [frame]
+    assert happenings(ChosenFrames("one", store, np.array([frame])), stops).code.tolist() == [0]
+
+
 def test_coverage_counts_who_did_what_after_what(drives: Store) -> None:
     found = sequences(ChosenFrames("all", drives), manoeuvres=THREE)
     covered = {row["sequence"]: row["frame"] for row in found.covered.dicts()}

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from sgstore.lang.library import pattern_named
-from sgstore.model.frame_ids import SEQ_BITS, trace_of
+from sgstore.model.frame_ids import frame_ids, trace_of
 from sgstore.testsets.coverage._chosen_frames import ChosenFrames, frames_of, traces_of
 from sgstore.testsets.coverage._frames import ReportTable
 
@@ -99,8 +99,8 @@ def _cells_of(chosen: ChosenFrames, road: str, said: dict[str, str]) -> Iterator
             said.setdefault(of, f"{of} is unknown: {unknown[of]}")
         # A match needs the ego on this road in its last frame.
         found = matches.intervals() if len(on_road) else iter(())
-        ends = [(names[i.trace] << SEQ_BITS) + i.end_seq for i in found if i.trace in names]
-        ends = _selected(chosen, np.array(ends, np.int64))
+        last = [(names[i.trace], i.end_seq) for i in found if i.trace in names]
+        ends = _selected(chosen, frame_ids(*np.array(last, np.int64).reshape(-1, 2).T))
         state = "covered" if len(ends) else "unknown" if len(unknown) == len(names) else "missing"
         yield (
             road,

@@ -19,7 +19,7 @@ from sgstore.errors import ConfigError
 from sgstore.lang.library import pattern_named, patterns
 from sgstore.lang.syntax import parse
 from sgstore.lang.syntax.tree import MatchClause
-from sgstore.model.frame_ids import SEQ_BITS, trace_of
+from sgstore.model.frame_ids import SEQ_BITS, frame_ids, trace_of
 from sgstore.model.world import JUMP_NS
 from sgstore.testsets.coverage._chosen_frames import ChosenFrames, names_of, traces_of
 from sgstore.testsets.coverage._features import MOST
@@ -171,7 +171,7 @@ class _Cast:
             if stepped
             else (interval.start_seq, interval.start_ns)
         )
-        return (trace << SEQ_BITS) + seq, time, f"{name}({', '.join(kinds)})"
+        return int(frame_ids(trace, seq)), time, f"{name}({', '.join(kinds)})"
 
 
 def sequences_in(code: Ints, time_ns: Ints, names: int, k: int, within_ns: int) -> dict[int, int]:
