@@ -14,7 +14,13 @@ from sgstore.exporters._recorder import Recorder, Written
 from sgstore.exporters._registry import EXPORTERS, GROUP, Exporter, Write, exporter_named, exporters
 from sgstore.exporters._sensor_data import cloud_of
 from sgstore.exporters._transforms import Mount, parse_mounts
-from sgstore.exporters._write import around_frames, labelled, whole_clips, write_export
+from sgstore.exporters._write import (
+    around_frames,
+    around_matches,
+    labelled,
+    whole_clips,
+    write_export,
+)
 
 __all__ = [
     "EXPORTERS",
@@ -31,6 +37,7 @@ __all__ = [
     "WrittenClip",
     "WrittenFile",
     "around_frames",
+    "around_matches",
     "check_folder",
     "cloud_of",
     "exporter_named",

@@ -67,6 +67,8 @@ class WrittenClip:
         Every channel of the source, including empty ones.
     context : int
         Number of context messages among them: outside the interval, but needed by later ones.
+    first_ns : int
+        Log time of the first message in the file. It is before ``start_ns`` if there is context.
     losses : tuple of Loss
         Unreadable parts of the source in the clip.
     provenance : dict
@@ -82,6 +84,7 @@ class WrittenClip:
     end_ns: int
     messages: tuple[ChannelCount, ...]
     context: int
+    first_ns: int
     losses: tuple[Loss, ...]
     provenance: dict[str, str]
 
@@ -99,6 +102,7 @@ class WrittenClip:
             "start_ns": self.start_ns,
             "seconds": round((self.end_ns - self.start_ns) / 1e9, 3),
             "messages": sum(channel.messages for channel in self.messages),
+            "context": self.context,
         }
 
 

@@ -208,6 +208,7 @@ class _Cutting:
         self._numbers: dict[int, int] = {}
         self._counts: dict[int, int] = {}
         self._carried = 0
+        self._first: int | None = None
 
     def write(self, file: Path, number: int) -> WrittenClip:
         """Write the clip to a file, verify the file, and return its description."""
@@ -250,6 +251,7 @@ class _Cutting:
                 for number, topic, schema in (*self._own_channels(), *more)
             ),
             context=self._carried,
+            first_ns=clip.start_ns if self._first is None else self._first,
             losses=tuple(losses),
             provenance=self._told,
         )
@@ -284,6 +286,7 @@ class _Cutting:
             "end_ns": str(reach.end_ns),
             "source": self._source.trace.path.name,
             "source_sha256": self._source.digest,
+            "context": "messages outside start_ns..end_ns, such as the map, are no frames of the clip",
         }
         self._writer.add_metadata(CLIP, {**self._told, **own})
         for place in recording.attachments:
@@ -337,6 +340,7 @@ class _Cutting:
         every = heapq.merge(self._messages(reach), added, key=lambda message: message[2])
         for channel, sequence, log_time, publish_time, data in every:
             own = self._numbers[channel]
+            self._first = log_time if self._first is None else self._first
             self._writer.add_message(own, log_time, bytes(data), publish_time, sequence)
             self._counts[channel] += 1
 

@@ -246,6 +246,7 @@ def test_a_clip_says_of_what_it_is_a_clip(tmp_path: Path) -> None:
         "end_ns": "1000001000",
         "source": "drive.mcap",
         "source_sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+        "context": "messages outside start_ns..end_ns, such as the map, are no frames of the clip",
     }
 
 
@@ -316,6 +317,10 @@ def test_clips_may_overlap_and_come_in_any_order(tmp_path: Path) -> None:
     counts = [{c.topic: c.messages for c in clip.messages}["truth"] for clip in written]
     assert counts == [6 + 1, 4, 5 + 1]
     assert [clip.context for clip in written] == [2, 0, 2]
+    for clip in written:
+        with clip.file.open("rb") as stream:
+            times = [message.log_time for _, _, message in make_reader(stream).iter_messages()]
+        assert clip.first_ns == min(times)
 
 
 def test_the_whole_file_stands_the_test_of_the_official_reader_record_by_record(

@@ -23,6 +23,7 @@ from sgstore.apps.cli._options import (
     say_unknown,
 )
 from sgstore.apps.cli._output import count_bar, say
+from sgstore.base.display import number_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -105,16 +106,17 @@ def export(
     if not written:
         say("no matches to export")
         return 0
+    if not clip.rebase_context:
+        _say_context(written)
     _write(written, out)
     return LOSS if any(one.losses for one in written) else 0
 
 
-def _say_joined(matches: Matches, clips: Sequence[Clip]) -> None:
+def _say_joined(matches: Matches, number: int, clips: int) -> None:
     """Print the notes about a query, and the number of matches if several share a clip."""
     say_left_out(matches)
-    number = sum(1 for _ in matches.intervals())
-    if number > len(clips):
-        say(f"{number} matches in {len(clips)} clips: matches that overlap share a clip")
+    if number > clips:
+        say(f"{number} matches in {number_of(clips, 'clip')}: matches that overlap share a clip")
 
 
 def _write(written: Sequence[WrittenClip | WrittenFile], out: PrintedRows) -> None:
@@ -122,6 +124,17 @@ def _write(written: Sequence[WrittenClip | WrittenFile], out: PrintedRows) -> No
     _say_lost(written)
     rows = [one.as_row() for one in written]
     out.write(tuple(rows[0]), [tuple(row.values()) for row in rows])
+
+
+def _say_context(written: Sequence[WrittenClip | WrittenFile]) -> None:
+    """If clips begin with messages from before their start, such as the map, print a note about them."""
+    early = [one.start_ns - one.first_ns for one in written if getattr(one, "context", 0)]
+    if early and max(early) > 0:
+        say(
+            f"{len(early)} of {number_of(len(written), 'clip')}: the first messages are context, such as the"
+            f" map, from up to {max(early) / 1e9:.3g} s before the start; --rebase-context moves them to"
+            " the start"
+        )
 
 
 def _say_lost(written: Sequence[WrittenClip | WrittenFile]) -> None:
