@@ -12,7 +12,7 @@ from matplotlib.patches import Circle
 import sgstore.draw._palette as palette
 from sgstore.draw._drawn_links import seen_from_ego, sentences
 from sgstore.draw._legend import Entry, paint_swatch
-from sgstore.draw._view import SCENERY, caption, clean, distance
+from sgstore.draw._view import SCENERY, caption, clean, distance, gap_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -118,13 +118,20 @@ def paint_surroundings(panel: Panel, scene: DrawnFrame, bottom: float) -> None:
     rows = int((panel.y - bottom - HEAD) // ROW)
     if not seen or rows < 2:
         return
-    far = {node: distance(ego, graph.nodes[node]) for node in seen}
+    gaps = {node: gap_of(ego, graph.nodes[node]) for node in seen}
+    far = {
+        node: distance(ego, graph.nodes[node]) if math.isnan(gap) else gap
+        for node, gap in gaps.items()
+    }
     near = sorted(seen, key=lambda n: (math.inf if math.isnan(far[n]) else far[n], n))
     rows = min(rows, _NEIGHBOURS)
     shown = near if len(near) <= rows else near[: rows - 1]
-    panel.head("Around the ego: what, how far, which relations to it")
+    centres = any(math.isnan(gaps[node]) and not math.isnan(far[node]) for node in shown)
+    note = " (c: of the centres)" if centres else ""
+    panel.head(f"Around the ego: what, gap{note}, which relations to it")
     for node in shown:
         metres = "" if math.isnan(far[node]) else f"{far[node]:.1f} m"
+        metres = f"c {metres}" if metres and math.isnan(gaps[node]) else metres
         name = caption(node, graph.nodes[node])
         light = graph.nodes[node].get("light_state")
         words = seen[node] if light is None else (f"is {clean(light, 12)}", *seen[node])

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
+from sgstore.model.pair_numbers import gap
 from sgstore.model.vocabulary import ENTITY_KINDS, SIGNALS
 
 if TYPE_CHECKING:
@@ -254,6 +255,15 @@ def distance(a: Mapping[str, Any], b: Mapping[str, Any]) -> float:
     return math.hypot(
         number(a, "x") - number(b, "x"), number(a, "y") - number(b, "y"), _or(dz, 0.0)
     )
+
+
+def gap_of(a: Mapping[str, Any], b: Mapping[str, Any]) -> float:
+    """Return the gap between the footprints of two nodes in metres: 0 if they touch, NaN if unknown."""
+    footprint = ("x", "y", "heading", "length", "width")
+    boxes = [np.array([[number(one, name) for name in footprint]]) for one in (a, b)]
+    for box in boxes:
+        box[:, 2] = np.radians(box[:, 2])
+    return float(gap(*boxes)[0])
 
 
 def _body(

@@ -171,6 +171,39 @@ def test_a_matched_node_is_named_with_its_variable_and_told_beside(tmp_path: Pat
     assert "p near, inDFrontOf, toRightOf e" in texts(root)
 
 
+@pytest.mark.parametrize(
+    ("size", "head", "metres"),
+    [
+        (
+            {"length": 4.0, "width": 2.0},
+            "Around the ego: what, gap, which relations to it",
+            "3.0 m",
+        ),
+        (
+            {"length": 14.0, "width": 2.0},
+            "Around the ego: what, gap, which relations to it",
+            "0.0 m",
+        ),
+        (
+            {"length": None},
+            "Around the ego: what, gap (c: of the centres), which relations to it",
+            "c 7.0 m",
+        ),
+    ],
+)
+def test_the_panel_has_the_gap_as_rules_have_and_labels_the_distance_of_centres(
+    tmp_path: Path, size: dict[str, Any], head: str, metres: str
+) -> None:
+    own = {"length": 4.0, "width": 2.0, "heading": 90.0}
+    nodes = {
+        0: {**entity("car", 5.0, 5.0, is_ego=True), **own},
+        1: {**entity("car", 5.0, 12.0), **own, **size},
+    }
+    draw_frame(graph_of(nodes, related(nodes)), None, tmp_path / "a.svg")
+
+    assert {head, metres} <= set(texts(svg(tmp_path / "a.svg")))
+
+
 def test_two_variables_of_one_node_are_both_named(tmp_path: Path) -> None:
     draw_frame(two(), None, tmp_path / "a.svg", highlight={"a": 17, "b": 17})
 
