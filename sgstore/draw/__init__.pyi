@@ -6,6 +6,7 @@ from ._charts import draw_matrix as draw_matrix
 from ._charts import draw_rank_sizes as draw_rank_sizes
 from ._picture import check_installed as check_installed
 from ._picture import draw_frame as draw_frame
+from ._picture import draw_graph as draw_graph
 from ._picture import draw_map as draw_map
 from ._stored import Bindings as Bindings
 from ._images import camera_image as camera_image

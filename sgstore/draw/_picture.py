@@ -24,6 +24,9 @@ from sgstore.model.world import seconds_of
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Sequence
     from pathlib import Path
+    from typing import Any
+
+    import networkx as nx
 
     from sgstore.draw._drawn_links import Relations
     from sgstore.draw._legend import Entry
@@ -153,6 +156,33 @@ def diagram_page(
     foot_box = (_MARGIN, _MARGIN, page.width - _MARGIN, bottom - _MARGIN / 2)
     page.once(("key", *key), foot_box, lambda: paint_key(page, key, foot_box))
     return page
+
+
+def draw_graph(graph: nx.MultiDiGraph[Any], to: str | Path, *, title: str, subtitle: str) -> None:
+    """Draw the graph of an abstraction: nodes in a ring around the ego, and a list of the edges.
+
+    Lines have no arrows: the list has the edges with their direction, those of the ego first. It
+    ends with the number of edges that do not fit.
+
+    Parameters
+    ----------
+    graph : networkx.MultiDiGraph
+        As returned by :meth:`sgstore.query.Store.graph` with an abstraction.
+    to : str or Path
+        ``….png`` or ``….svg``.
+    title, subtitle : str
+
+    Raises
+    ------
+    ExportError
+        The ending is unknown, or the file cannot be written.
+    MissingExtraError
+        The drawing packages are not installed.
+    """
+    with drawing(to):
+        from sgstore.draw._abstraction import graph_page
+
+        graph_page(graph, title, subtitle).save(to)
 
 
 def draw_map(road_map: RoadMap, to: str | Path, *, title: str | None = None) -> None:

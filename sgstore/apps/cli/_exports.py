@@ -252,12 +252,24 @@ class DrawOptions:
         return {"matches": matches, **options}
 
 
+def _draw_abstraction(store: Store, frame: str, abstraction: str, to: Path) -> None:
+    """Draw the graph of a frame in an abstraction."""
+    from sgstore.draw import draw_graph
+
+    graph = store.graph(frame, abstraction)
+    ref = store.file.frame(frame)
+    size = f"{number_of(len(graph), 'node')}, {number_of(graph.number_of_edges(), 'edge')}"
+    title = f"{ref.trace}   frame {ref.seq}   {ref.t:.3f} s"
+    draw_graph(graph, to, title=title, subtitle=f"graph of the abstraction {abstraction}: {size}")
+
+
 @verbs.command(rich_help_panel=PANEL)
 def show(
     store: StorePath,
     frame: Annotated[str, Argument(autocompletion=completion.frames)],
     question: Question,
     to: Annotated[Path | None, Option("--to", "-o", show_default="frame.png, clip.gif")] = None,
+    abstraction: str = "",
     *,
     drawn: DrawOptions,
     bounds: QueryLimits,
@@ -270,6 +282,8 @@ def show(
         A frame_id, TRACE#SEQ, or TRACE@12.3s; a clip: TRACE@12s..18s.
     to
         The picture: .png or .svg; of a clip: .gif, .mp4 or .webm.
+    abstraction : NAME
+        Draw the graph of this abstraction instead: E, EL, ER, RSV, …; its nodes and edges.
     """
     from sgstore.draw import draw_clip, draw_stored
     from sgstore.model.frame_ids import range_of
@@ -278,6 +292,14 @@ def show(
     text, values = question.asked() if question else ("", {})
     clip = range_of(frame)
     to = to or Path("clip.gif" if clip else "frame.png")
+    if abstraction:
+        if clip or text or drawn != DrawOptions():
+            raise typer.BadParameter(
+                "--abstraction draws the whole graph of one frame; it takes no clip, query or look"
+            )
+        _draw_abstraction(opened, frame, abstraction, to)
+        typer.echo(to)
+        return 0
     options = drawn.options(opened.find(text, **values) if text else None)
     if clip is None:
         marked = int(draw_stored(opened, frame, to, **options))
