@@ -15,7 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from graph_blocks import RandomTrace, publish
+from recordings import Recorder, car
 
+import sgstore
 from sgstore.apps.cli import run
 from sgstore.errors import ConfigError
 from sgstore.pipeline.importing import import_graphs
@@ -138,6 +140,27 @@ def test_an_expression_is_a_measure_whose_least_value_comes_first(some: ChosenFr
     assert alone.reasons()[0].startswith(f"{rule} is ")
     with pytest.raises(ConfigError, match="expected a number"):
         prioritize(some, PrioritySpec(measures=("ego.kind",)))
+
+
+@pytest.mark.parametrize("last", [0.01, 6.0])
+def test_required_accelerations_before_a_contact_have_a_note(tmp_path: Path, last: float) -> None:
+    """The ego is 9 m/s faster than the car ahead; the last gap decides if it can still brake."""
+    with Recorder(tmp_path / "drive.mcap") as recorder:
+        for frame in range(4):
+            x, gap = float(frame), last + 0.9 * (3 - frame)
+            ahead = car(2, x + gap + car(1).base.dimension.length, v=(1, 0))
+            recorder.ground_truth(frame / 10, [car(1, x, v=(10, 0)), ahead], host=1)
+    store = sgstore.open(tmp_path / "s.sgstore", create=True)
+    store.ingest(tmp_path / "drive.mcap")
+
+    found = prioritize(ChosenFrames("s", store), PrioritySpec(measures=("a_long_req", "dce")))
+
+    least = found.worst[0].value.min()
+    assert least == pytest.approx(-81 / 2 / last, rel=1e-3)
+    notes = [note for note in found.said if "contact follows" in note]
+    assert len(notes) == (least < -11.5)
+    if notes:  # at gaps of 2.71, 1.81, 0.91 and 0.01 m
+        assert notes[0].startswith("4 frames with a_long_req beyond 11.5 m/s²")
 
 
 def test_the_worst_of_a_clip_is_that_of_its_frames(open_town: Store) -> None:

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from sgstore.base.display import number_of
 from sgstore.errors import ConfigError
 from sgstore.model.criticality import RECORDED
 from sgstore.model.frame_ids import trace_of
@@ -63,6 +64,8 @@ if TYPE_CHECKING:
 MEASURES: Final = ("closing_time", "ttc_mild")
 """Default criticality measures for the order by risk: gap divided by closing speed, and ``ttc_mild``."""
 
+AVOIDABLE: Final = 11.5
+"""Largest acceleration of a vehicle; m/s². It is that of ``btn``."""
 RANKED: Final = {name: one for name, one in PAIR_FUNCTIONS.items() if one.sql and one.worse}
 """Criticality measures of entity pairs in a frame that can order test cases."""
 
@@ -408,6 +411,15 @@ def _lacking(spec: PrioritySpec, units: Units, worst: Sequence[WorstValues]) -> 
             told.append(
                 f"{many:,} of {len(here):,} frames have no ego: nothing is known of whom it could meet, and"
                 " their order is chance; ingest with --ego NAME says who it is"
+            )
+    for one in worst:
+        known = PAIR_FUNCTIONS.get(one.name)
+        if known is None or known.unit != "m/s²":
+            continue
+        if many := int((np.abs(one.value) > AVOIDABLE).sum()):
+            told.append(
+                f"{number_of(many, spec.unit)} with {one.name} beyond {AVOIDABLE:g} m/s²: contact follows,"
+                " and no vehicle can avoid it; such values only grow as the gap closes"
             )
     if blind := max((one.blind for one in worst), default=0):
         told.append(
