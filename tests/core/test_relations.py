@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -18,6 +18,9 @@ from sgstore.graphs.relations import BlockScene, Relation, as_markdown, relation
 from sgstore.model.config import Config, Direction, PairSettings, Proximity, RangeSettings
 from sgstore.model.vocabulary import DIRECTIONS, PROXIMITY, SIDES, SIGNALS, VEHICLES
 from sgstore.sgg import SceneGraphGenerator
+
+if TYPE_CHECKING:
+    from sgstore.query import Store
 
 pytestmark = pytest.mark.seconds(6)
 
@@ -632,3 +635,15 @@ def test_the_page_of_relations_is_made_from_their_declarations() -> None:
     page = Path(__file__).parents[2] / "docs" / "relations.md"
 
     assert page.read_text(encoding="utf-8") == as_markdown()
+
+
+def test_signs_of_the_map_have_numbers_but_no_relations_of_distance(open_town: Store) -> None:
+    found = open_town.find(
+        "MATCH (e:Ego), (s:Sign) WHERE dist(e, s) < 45 RETURN dist(e, s), e.x, e.y, e.z, s.x, s.y, s.z"
+    ).rows()
+    assert len(found) > 100
+    for row in found[::10]:
+        dist, *place = (row[number] for number in range(7))
+        assert dist == pytest.approx(math.dist(place[:3], place[3:]), abs=1e-3)
+    assert open_town.find("MATCH (e:Ego)-[r]-(s:Sign)").count() == 0
+    assert open_town.find("MATCH (e:Ego)-[r:visible|near]-(s:TrafficLight)").count() > 100

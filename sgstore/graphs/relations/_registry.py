@@ -52,6 +52,10 @@ Edges of a scene graph, by name. What a relation needs and a recording lacks mak
 | relation | needs | meaning |
 |---|---|---|
 {rows}
+
+Signals and objects of the map, such as signs, have no relations of distance or direction, by design; those of
+a recording have them. CARLASGG lists signs in its tables of distances, but under names that it never gives to
+a node, so it draws none. `dist(e, s) < 20` works for each `(s:Sign)`.
 """
 
 
