@@ -610,7 +610,7 @@ class Records:
             edges = road_map.edges
             about = cache(partial(_map_node, road_map))
             along = road_map.places.rows(), road_map.courses.rows()
-            reach = LaneDistances(*road_map.reach, *along)
+            reach = LaneDistances(*road_map.reach, *along, road_map.links())
             self._map = MapRecords(about, edges.src, edges.relation, edges.dst, reach)
 
     def stand(self, known: EntityConstants, states: States, row: int) -> None:

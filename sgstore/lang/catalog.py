@@ -106,6 +106,8 @@ class DisplayUnit(StrEnum):
     """True if a node is in the graph of the frame. For a moving entity, its state holds this flag."""
     role = "role"
     """Role of a lane relative to the ego, frame by frame: view ``roles``."""
+    chain = "chain"
+    """Chain of lanes that a lane belongs to. The store computes it from the edges of the map."""
     own = "own"
     """User-defined attribute, frame by frame: view ``attributes``."""
     span = "span"
@@ -440,6 +442,13 @@ NODE_ATTRIBUTES: Final = _named(
             "what a lane is to the ego: 'Ego Lane', 'Left 1 of Ego Lane', 'Opposing Lane 0'",
             DisplayUnit.role,
             _LANES,
+        ),
+        _of_map(
+            "chain",
+            Type.number,
+            "of a lane: the same number in all parts of the map that are one lane, outside of junctions",
+            _LANES,
+            DisplayUnit.chain,
         ),
         _of_map("speed_limit", Type.number, "m/s", _LANES | {"road"}),
         _of_map(
@@ -799,6 +808,9 @@ class TraceFacts:
     uneven: int = sum(UNEVEN.values())
     excluded: frozenset[str] = frozenset()
 
+
+LANE_CHAINS: Final = ":lane chains"
+"""Name of the temporary table with the lanes that continue as one lane."""
 
 TOPIC: Final = ":topic-value "
 """Start of the names of relations with the values of a topic at frames."""

@@ -1057,6 +1057,18 @@ def is_counted(expression: Bound) -> bool:
     return any(isinstance(part, Aggregate) for part in walk(expression))
 
 
+def same_chain(where: Iterable[Bound]) -> Iterator[tuple[str, str]]:
+    """Yield the pairs of lanes for which a condition requires the same chain. They may be one lane."""
+    for condition in where:
+        match condition:
+            case Operation("=", (NodeAttribute(a, of_a), NodeAttribute(b, of_b))) if (
+                of_a.unit is of_b.unit is DisplayUnit.chain
+            ):
+                yield a, b
+            case _:
+                pass
+
+
 def nodes_of(expression: Bound) -> frozenset[str]:
     """Return the keys of the nodes in an expression. In braces, only nodes of the outer pattern count."""
     found: set[str] = set()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     EdgeRecord = tuple[int, str, int, Attributes]
 
 K = TypeVar("K")
+Lane = TypeVar("Lane", int, tuple[int, int])
 V = TypeVar("V")
 
 IS_IN, LEADS, FOLLOWS = (RELATION_CODE[name] for name in ("isIn", "leads", "follows"))
@@ -344,6 +346,43 @@ def _grouped(pairs: Iterable[tuple[K, V]]) -> dict[K, list[V]]:
     return found
 
 
+MOST_PARTS: Final = 256
+"""Largest number of parts of a map that count as one lane, because the number of their pairs is its square."""
+
+
+def lane_chains(links: Iterable[tuple[Lane, Lane, bool]]) -> dict[Lane, Lane]:
+    """Return the lanes that continue as one lane, each with the greatest id in its chain.
+
+    A map has a lane in several parts, such as lane sections. A chain ends where a junction begins or ends, and
+    where a lane has several next lanes or several previous lanes. It has at most :data:`MOST_PARTS` lanes.
+
+    Parameters
+    ----------
+    links : iterable of (lane, lane, bool)
+        Lanes, their next lanes, and true if both are in one junction or in none.
+
+    Examples
+    --------
+    >>> lane_chains([(-2, -3, True), (-3, -4, True), (-4, -5, True), (-4, -6, True)])
+    {-2: -2, -3: -2, -4: -2}
+    """
+    links = list(links)
+    leaving, coming = (Counter(link[end] for link in links) for end in (0, 1))
+    onward = {a: b for a, b, inside in links if inside and leaving[a] == coming[b] == 1}
+    chains: dict[Lane, Lane] = {}
+    for lane in [*sorted(onward.keys() - onward.values()), *onward]:  # a ring has no first lane
+        members: list[Lane] = []
+        at: Lane | None = lane
+        while at is not None and at not in chains:
+            chains[at] = at
+            members.append(at)
+            at = onward.get(at)
+        for first in range(0, len(members), MOST_PARTS):
+            part = members[first : first + MOST_PARTS]
+            chains |= dict.fromkeys(part, max(part))
+    return chains
+
+
 class LaneDistances:
     """Distances along the lanes of a map, between lanes and to map parts. Also curvature and slope.
 
@@ -359,6 +398,8 @@ class LaneDistances:
     courses : iterable of (int, float, float, float)
         Stretches of lanes, each up to the next: lane, start (m), curvature (1/m) and slope. NaN or ``None``
         means an unknown slope.
+    links : iterable of (int, int, bool)
+        Lanes, their next lanes, and true if both are in one junction or in none.
     """
 
     FARTHEST: Final = 200.0
@@ -371,10 +412,19 @@ class LaneDistances:
         start: Floats,
         parts: Iterable[tuple[int, str, int, float, float]] = (),
         courses: Iterable[tuple[int, float, float, float | None]] = (),
+        links: Iterable[tuple[int, int, bool]] = (),
     ) -> None:
         places = [part for part in parts if not part[1].startswith("{")]  # others are attributes
         self._columns, self._parts = (lane, other, start), tuple(places)
-        self._courses = tuple(courses)
+        self._courses, self._links = tuple(courses), links
+
+    @cached_property
+    def _chains(self) -> dict[int, int]:
+        return lane_chains(self._links)
+
+    def chain(self, lane: int) -> int:
+        """Return the number of the chain of lanes that a lane belongs to: see :func:`lane_chains`."""
+        return self._chains.get(lane, lane)
 
     @cached_property
     def _starts(self) -> dict[tuple[int, int], list[float]]:

@@ -18,9 +18,11 @@ from typing import TYPE_CHECKING, Any, Final
 import duckdb
 from duckdb.func import FunctionNullHandling
 
+from sgstore.base.quoting import quoted
 from sgstore.errors import ConfigError
-from sgstore.lang.catalog import TOPIC
+from sgstore.lang.catalog import LANE_CHAINS, TOPIC
 from sgstore.model.criticality import FIXED_KINDS, KNOWN, RECORDED
+from sgstore.model.graph import lane_chains
 from sgstore.store._interrupts import interrupted
 from sgstore.store._lease import stamp_of
 from sgstore.store._meetings import RecordedValues
@@ -139,6 +141,8 @@ def show_recorded(connection: DuckDBPyConnection, sql: str) -> None:
         return
     if TOPIC in sql:
         show_topic_values(connection, access, sql)
+    if LANE_CHAINS in sql:
+        _show_lane_chains(connection, access)
     if _WANTED.search(sql) is None:
         return
     if any(asked.asking is connection for asked in list(_questions.values())):
@@ -167,6 +171,43 @@ def show_recorded(connection: DuckDBPyConnection, sql: str) -> None:
         f"CREATE TEMP MACRO recorded({arguments}) AS {_FUNCTION}({token}, {arguments})"
     )
     connection.execute(_VIEW)
+
+
+_LINKS: Final = f"""
+SELECT e.map_id, e.src, e.dst, a.junction IS NOT DISTINCT FROM b.junction
+FROM {INSIDE}.map_edge e
+  JOIN {INSIDE}.map_node a ON a.map_id = e.map_id AND a.node_id = e.src
+  JOIN {INSIDE}.map_node b ON b.map_id = e.map_id AND b.node_id = e.dst
+WHERE e.relation = 'travelsTo'
+"""
+_PAIRS: Final = f"""
+CREATE OR REPLACE TEMP TABLE {quoted(LANE_CHAINS)} AS
+WITH chains AS (
+  SELECT n.map_id, n.node_id AS lane, coalesce(c.chain, n.node_id) AS chain
+  FROM {INSIDE}.map_node n LEFT JOIN (
+    SELECT unnest($1::BIGINT[]) AS map_id, unnest($2::INTEGER[]) AS lane, unnest($3::INTEGER[]) AS chain
+  ) c ON c.map_id = n.map_id AND c.lane = n.node_id
+  WHERE n.kind = 'lane'
+)
+SELECT a.map_id, a.lane AS src, b.lane AS dst
+FROM chains a JOIN chains b ON b.map_id = a.map_id AND b.chain = a.chain
+"""
+
+
+def _show_lane_chains(connection: DuckDBPyConnection, access: Access) -> None:
+    """Create the temporary table of all pairs of lanes that are parts of one lane."""
+    place = access.path, stamp_of(access.path)
+    if place not in _chains:
+        links = connection.execute(_LINKS).fetchall()
+        found = lane_chains(((at, a), (at, b), inside) for at, a, b, inside in links)
+        rows = [(at, lane, chain) for (at, lane), (_, chain) in found.items()]
+        _chains.clear()
+        _chains[place] = [[row[column] for row in rows] for column in range(3)]
+    connection.execute(_PAIRS, _chains[place])
+
+
+_chains: Final[dict[tuple[Path, Stamp], list[list[int]]]] = {}
+"""Map, lane and chain of the lanes that have several parts, for the file that was read last."""
 
 
 def measured(

@@ -379,7 +379,12 @@ def _map_records(connection: DuckDBPyConnection, map_id: int) -> MapRecords:
         if what.startswith("{"):
             nodes[node] = json.loads(what) | nodes[node]
     courses = connection.execute(_MAP_COURSES, where).fetchall()
-    starts = LaneDistances(along, other, reach["start"].astype(np.float64), parts, courses)
+    flow = relation == RELATION_CODE["travelsTo"]
+    links = [
+        (a, b, nodes[a].get("junction") == nodes[b].get("junction"))
+        for a, b in zip(src[flow].tolist(), dst[flow].tolist(), strict=True)
+    ]
+    starts = LaneDistances(along, other, reach["start"].astype(np.float64), parts, courses, links)
     return MapRecords(nodes.__getitem__, src, relation, dst, starts)
 
 

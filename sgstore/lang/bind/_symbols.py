@@ -14,7 +14,13 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from sgstore.errors import QueryError, QueryNameError
 from sgstore.lang.bind._in_range import scopes_of
-from sgstore.lang.catalog import PAIR_NAMES, RECORDED_OWN, TOLERANCE_NS, Type, topic_attribute
+from sgstore.lang.catalog import (
+    PAIR_NAMES,
+    RECORDED_OWN,
+    TOLERANCE_NS,
+    Type,
+    topic_attribute,
+)
 from sgstore.lang.ir import (
     Bound,
     Edge,
@@ -23,6 +29,7 @@ from sgstore.lang.ir import (
     Node,
     Scope,
     ego_kinds,
+    same_chain,
     with_operands,
 )
 from sgstore.lang.library import predicates
@@ -270,7 +277,8 @@ class ScopeBuilder:
                     self.nodes[a].span,
                     "a frame has one ego: write (ego) in both places, or USING NODES any",
                 )
-        return frozenset(pairs)
+        mates = {pair for one in same_chain(self.where) for pair in (one, one[::-1])}
+        return frozenset(pairs - mates)
 
 
 @dataclass(slots=True)

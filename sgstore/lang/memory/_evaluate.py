@@ -22,7 +22,7 @@ from sgstore.lang.catalog import (
     DisplayUnit,
     Type,
 )
-from sgstore.lang.memory._frame_view import NodeColumns, attribute_of
+from sgstore.lang.memory._frame_view import FrameView, NodeColumns, attribute_of
 from sgstore.lang.operators import OPERATORS, Column
 from sgstore.model.criticality import RECORDED
 from sgstore.model.pair_numbers import WAYS
@@ -30,7 +30,7 @@ from sgstore.model.vocabulary import NOISE_MARKS
 
 if TYPE_CHECKING:
     from sgstore.lang.catalog import Attribute
-    from sgstore.lang.memory._frame_view import Attributes, FrameView
+    from sgstore.lang.memory._frame_view import Attributes
     from sgstore.model.world import Bools
 
 
@@ -125,16 +125,15 @@ def _of_node(node: str, attribute: Attribute) -> Evaluate:  # noqa: PLR0911 - a 
     """Return a function that computes an attribute of a node in memory."""
     if attribute.unit is DisplayUnit.binding:
         return lambda at: at.nodes[node]
-    if attribute.unit is DisplayUnit.role:
-        return lambda at: at.view.role_of(at.nodes[node])
+    if attribute.unit in _OF_VIEW:
+        value = _OF_VIEW[attribute.unit]
+        return lambda at: value(at.view, at.nodes[node])
     if attribute in _UNSURE:
         return lambda at: at.nodes[node] in getattr(at.view.graph, attribute.name)
     if attribute is NODE_ATTRIBUTES["injunction"]:
         return lambda at: _in_junction(at, at.nodes[node])
     if attribute is NODE_ATTRIBUTES["type"]:
         return lambda at: _type_of(at.view.nodes[at.nodes[node]])
-    if attribute.unit is DisplayUnit.inside:
-        return lambda at: at.view.draws(at.nodes[node])
     name = attribute.name
     if attribute is NODE_ATTRIBUTES["lifetime"]:
         return lambda at: _lifetime(at.nodes[node], at.view.nodes[at.nodes[node]])
@@ -145,6 +144,13 @@ def _of_node(node: str, attribute: Attribute) -> Evaluate:  # noqa: PLR0911 - a 
         return lambda at: attribute_of(at.view.nodes[at.nodes[node]], name)
     return lambda at: at.view.nodes[at.nodes[node]].get(name)
 
+
+_OF_VIEW: Final = {
+    DisplayUnit.role: FrameView.role_of,
+    DisplayUnit.chain: FrameView.chain_of,
+    DisplayUnit.inside: FrameView.draws,
+}
+"""Functions for attributes that depend on the frame, or on the whole map."""
 
 _UNSURE: Final = frozenset({UNSURE_LANE, UNSURE_LEAD})
 
@@ -319,6 +325,7 @@ def _is_derived(attribute: Attribute) -> bool:
         DisplayUnit.inside,
         DisplayUnit.binding,
         DisplayUnit.role,
+        DisplayUnit.chain,
         DisplayUnit.own,
     } or attribute in {
         *(NODE_ATTRIBUTES["injunction"], NODE_ATTRIBUTES["lifetime"]),

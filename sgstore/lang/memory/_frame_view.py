@@ -158,6 +158,12 @@ class FrameView:
         """Return the role of a lane relative to the ego in this frame, or None if unknown."""
         return None if self.graph.ego in self.graph.unsure_lane else self._roles.get(node)
 
+    def chain_of(self, node: int) -> int | None:
+        """Return the chain of lanes that a lane belongs to; ``None`` for other nodes."""
+        if self.nodes[node]["kind"] != "lane":
+            return None
+        return node if self.graph.reach is None else self.graph.reach.chain(node)
+
     @cached_property
     def _roles(self) -> Mapping[int, str]:
         return self.roles() if self.roles else {}

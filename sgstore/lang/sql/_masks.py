@@ -18,8 +18,18 @@ from typing import TYPE_CHECKING, Final
 
 from sgstore.base.quoting import quoted
 from sgstore.lang.bind import Profile, alias_of, edge_conditions, homes_of, kind_conditions
-from sgstore.lang.catalog import Home
-from sgstore.lang.ir import Bound, Edge, Happened, Kinds, Node, NodeAttribute, Scope, ego_kinds
+from sgstore.lang.catalog import LANE_CHAINS, Home
+from sgstore.lang.ir import (
+    Bound,
+    Edge,
+    Happened,
+    Kinds,
+    Node,
+    NodeAttribute,
+    Scope,
+    ego_kinds,
+    same_chain,
+)
 from sgstore.lang.sql._attributes import Aliases, among, attribute_text
 from sgstore.lang.sql._expressions import (
     Leaf,
@@ -363,13 +373,15 @@ def base_rows(
     base = Base()
     if given is not None and scope.outer:
         _join_given(sql, base, scope, given)
-    single, lane = dict(parts.single), dict(parts.lane)
+    single, lane, mates = dict(parts.single), dict(parts.lane), parts.mates
     order, steps = _from_ego(sql, scope, base)
     for number, edge in enumerate(order, start=1):
         _join_edge(sql, base, scope, edge)
         if edge.key in lane:
             _join_lane(sql, base, scope, edge, lane.pop(edge.key), parts.single.get(edge.dst, []))
-        if number in steps:
+        others = _join_mates(base, mates)
+        tied, mates = len(others) < len(mates), others
+        if number in steps or (tied and steps and number < len(order)):
             later = {end for one in order[number:] for end in (one.src, one.dst)}
             _join_tests(sql, base, scope, set(base.nodes) - later - parts.late, single)
             _begin_anew(sql, base, scope)
@@ -408,9 +420,10 @@ def _from_ego(sql: SqlBuilder, scope: Scope, base: Base) -> tuple[tuple[Edge, ..
     if len(edges) <= _FEW or not any({edge.src, edge.dst} & begin for edge in edges):
         return edges, range(0)
     edges = ordered(scope, sql.catalog, begin).edges
-    seen, connected = set(begin), 0
+    seen, connected, mates = set(begin), 0, [*same_chain(scope.where)]
     while connected < len(edges) and {edges[connected].src, edges[connected].dst} & seen:
         seen |= {edges[connected].src, edges[connected].dst}
+        seen |= {key for pair in mates if seen.intersection(pair) for key in pair}
         connected += 1
     return edges, range(_EDGES if base.nodes else 1, min(connected, len(edges) - 1) + 1, _EDGES)
 
@@ -743,6 +756,17 @@ def _join_conditions(
     node = f'{alias}."node_id"'
     base.tie(f'"{table}" AS {alias}', {key: node}, on)
     base.select.where += [node_text(c, node, at, sql.values) for c in conditions]
+
+
+def _join_mates(base: Base, mates: list[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Join lanes of one chain to the lanes that are joined already. Return the other pairs of lanes."""
+    for a, b in [pair for pair in mates if base.nodes.keys() & pair]:
+        alias = quoted(f"{a} {b}:chain")
+        base.need_bucket()
+        on = [f'{alias}."map_id" = {BUCKET}."map_id"']
+        ends = {a: f'{alias}."src"', b: f'{alias}."dst"'}
+        base.tie(f"{quoted(LANE_CHAINS)} AS {alias}", ends, on)
+    return [pair for pair in mates if not base.nodes.keys() & pair]
 
 
 def _join_lane(

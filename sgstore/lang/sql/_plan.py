@@ -26,6 +26,7 @@ from sgstore.lang.ir import (
     TraceAttribute,
     blocks_of,
     nodes_of,
+    same_chain,
     walk,
 )
 from sgstore.lang.sql._expressions import Leaf, leaves
@@ -99,6 +100,8 @@ class Phases:
         Conditions on attributes of a single node, by node: evaluated by masks.
     lane : dict
         Conditions on attributes of a single edge, by edge: evaluated by masks.
+    mates : list of (str, str)
+        Lanes that must have one chain: evaluated in the join of the edges.
     direct : list
         Conditions on node ids, relations and constants: evaluated in the join of the edges.
     alone : list of BlockValue
@@ -118,6 +121,7 @@ class Phases:
     blocks: list[Bound] = field(default_factory=list[Bound])
     single: dict[str, list[Bound]] = field(default_factory=dict[str, list[Bound]])
     lane: dict[str, list[Bound]] = field(default_factory=dict[str, list[Bound]])
+    mates: list[tuple[str, str]] = field(default_factory=list[tuple[str, str]])
     direct: list[Bound] = field(default_factory=list[Bound])
     alone: list[BlockValue] = field(default_factory=list[BlockValue])
     happened: list[Happened] = field(default_factory=list[Happened])
@@ -155,6 +159,10 @@ def _file(condition: Bound, parts: Phases, scope: Scope, catalog: Catalog) -> No
         return
     if isinstance(condition, Happened):
         parts.happened.append(condition)
+        return
+    mates = [*same_chain((condition,))]
+    if mates and set(mates[0]) <= {key for edge in scope.edges for key in (edge.src, edge.dst)}:
+        parts.mates += mates
         return
     found = set(leaves(condition))
     if all(_is_direct(leaf) for leaf in found):

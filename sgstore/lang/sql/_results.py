@@ -12,7 +12,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sgstore.base.quoting import quoted
 from sgstore.lang.bind import Profile
-from sgstore.lang.catalog import NODE_ATTRIBUTES, TRACE_ATTRIBUTES, Catalog, DisplayUnit, Type
+from sgstore.lang.catalog import (
+    LANE_CHAINS,
+    NODE_ATTRIBUTES,
+    TRACE_ATTRIBUTES,
+    Catalog,
+    DisplayUnit,
+    Type,
+)
 from sgstore.lang.ir import (
     CLIP_COLUMNS,
     FRAME_COLUMNS,
@@ -721,11 +728,19 @@ def finished(writer: SqlBuilder, text: str, columns: Iterable[str]) -> SqlStatem
     shadows = [
         (f"{quoted(name)} AS NOT MATERIALIZED", body) for name, body in writer.catalog.shadows
     ]
+    if any('."chain"' in body for body in (text, *(body for _, body in writer.shared))):
+        shadows.append(('"map_node" AS NOT MATERIALIZED', _WITH_CHAINS))
     shared = [(f"{quoted(name)} AS", body) for name, body in writer.shared]
     sql, last = _preceded([*shadows, *shared], text), _preceded(shadows, text)
     stages = tuple((name, _preceded(shadows, body)) for name, body in writer.shared)
     values = tuple(writer.values.items)
     return SqlStatement(sql, values, tuple(columns), writer.gathered, stages, last)
+
+
+_WITH_CHAINS: Final = f"""SELECT n.*, c.chain FROM inside.map_node n LEFT JOIN (
+  SELECT map_id, src, max(dst) AS chain FROM {quoted(LANE_CHAINS)} GROUP BY map_id, src
+) c ON c.map_id = n.map_id AND c.src = n.node_id"""  # noqa: S608  words of ours
+"""SQL for the table of map parts, with the chain of each lane."""
 
 
 def _preceded(relations: Iterable[tuple[str, str]], text: str) -> str:

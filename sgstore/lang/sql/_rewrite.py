@@ -53,6 +53,7 @@ from sgstore.lang.ir import (
     ego_kinds,
     is_one_of,
     nodes_of,
+    same_chain,
     walk,
     with_operands,
 )
@@ -612,9 +613,10 @@ def ordered(scope: Scope, catalog: Catalog, begin: Iterable[str] = ()) -> Scope:
         found = possible(edge, scope.kinds(edge.src), scope.kinds(edge.dst), counts)
         return sum(counts.get(triple, 0) for triple in set(found))
 
-    waiting, result = list(scope.edges), list[Edge]()
+    waiting, result, mates = list(scope.edges), list[Edge](), [*same_chain(scope.where)]
     seen = {*scope.outer, *begin}
     while waiting:
+        seen |= {key for pair in mates if seen.intersection(pair) for key in pair}
         connected = [e for e in waiting if {e.src, e.dst} & seen] or waiting
         rarest = min(connected, key=rows)
         waiting.remove(rarest)

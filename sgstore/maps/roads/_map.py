@@ -551,6 +551,13 @@ class RoadMap:
             self._ways = limit, (lane, other, distance)
         return self._ways[1]
 
+    def links(self) -> list[tuple[int, int, bool]]:
+        """Return the lanes that traffic connects: node ids, and true if both are in one junction or in none."""
+        flow = self.edges.relation == RELATION_CODE["travelsTo"]
+        ends = self.edges.src[flow].tolist(), self.edges.dst[flow].tolist()
+        at = self.nodes.junction
+        return [(a, b, at[-1 - a] == at[-1 - b]) for a, b in zip(*ends, strict=True)]
+
     @cached_property
     def reach(self) -> tuple[Ints, Ints, Floats]:
         """Return pairs of lanes that traffic connects, and the distance from one start to the other.

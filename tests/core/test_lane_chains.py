@@ -1,0 +1,125 @@
+"""Lanes that a map has in several parts: chains of lanes, and the answers of the library on such maps."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import TYPE_CHECKING
+
+import networkx as nx
+import numpy as np
+import pytest
+from library_scenes import SCENES, WAYS, on
+from scenes import store_of, street
+from thorough import LONG
+
+from sgstore.lang.library import patterns
+from sgstore.lang.memory import FrameView
+from sgstore.model.graph import MOST_PARTS, lane_chains
+from sgstore.temporal import Monitor
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from sgstore.query import Store
+
+pytestmark = pytest.mark.seconds(20)
+
+CUTS = (20.0, 45.0, 70.0)
+"""x at which both lanes go on as other parts of the map."""
+ON_WAYS = [name for name, (one, _) in SCENES.items() if one is not None and one.road is WAYS]
+CHANGED = ("cut_in", "cut_out", "CutIn", "iso_cut_in", "iso_lead_brakes", "r157_cut_in")
+"""Patterns with other answers on roads in parts, before lanes had chains."""
+NAMES = ON_WAYS if LONG else [name for name in ON_WAYS if name in CHANGED]
+
+
+# Chains of a map --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_chains_are_the_connected_parts_of_single_links(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    ends = rng.integers(-40, -1, (30, 2)).tolist()
+    links = [(a, b, bool(rng.random() < 0.9)) for a, b in dict.fromkeys(map(tuple, ends)) if a != b]
+    leaving, coming = (Counter(one[end] for one in links) for end in (0, 1))
+    graph = nx.Graph((a, b) for a, b, inside in links if inside and leaving[a] == coming[b] == 1)
+
+    expected = {lane: max(of) for of in nx.connected_components(graph) for lane in of}
+
+    assert lane_chains(links) == expected
+
+
+def test_a_ring_is_one_chain_and_a_long_chain_has_several_numbers() -> None:
+    ring = [(-2, -3, True), (-3, -4, True), (-4, -2, True)]
+    long = [(-lane, -lane - 1, True) for lane in range(2, 2 * MOST_PARTS + 2)]
+
+    assert lane_chains(ring) == dict.fromkeys((-2, -3, -4), -2)
+    assert [*Counter(lane_chains(long).values()).values()] == [MOST_PARTS, MOST_PARTS, 1]
+
+
+# The same scenes on a road in parts -------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
+    roads = {cut: street("driving", "driving", cut=cut) for cut in (None, *CUTS)}
+    traces = {
+        f"{name} {number} {cut}": [on(scene, road)]
+        for name in NAMES
+        for number, scene in enumerate(SCENES[name])
+        if scene is not None and scene.road is WAYS
+        for cut, road in roads.items()
+    }
+    store = store_of(tmp_path_factory.mktemp("chains") / "s.sgstore", traces)
+    with store.file.snapshot():
+        yield store
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_parts_of_the_map_do_not_change_an_answer(store: Store, name: str) -> None:
+    one = patterns()[name]
+    found: dict[str, list[object]] = {trace.name: [] for trace in store.traces()}
+    if one.kind == "property":
+        for verdict in store.check(one.text):
+            found[verdict.trace] = [verdict.verdict]
+    else:
+        for match in store.find(one.text).intervals(bound=True):
+            found[match.trace].append((match.start_seq, match.end_seq))
+    whole = {trace: answer for trace, answer in found.items() if trace.endswith(f"{name} 0 None")}
+
+    assert any(whole.values())
+    for number in range(2):
+        answers = [
+            sorted(found.get(f"{name} {number} {cut}", ()), key=str) for cut in (None, *CUTS)
+        ]
+        assert answers == [answers[0]] * len(answers)
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name in CHANGED])
+def test_a_monitor_finds_the_scene_on_a_road_in_parts(store: Store, name: str) -> None:
+    told: list[str] = []
+    trace = f"{name} 0 {CUTS[1]}"
+    ids = store.file.arrays("SELECT frame_id FROM frames WHERE trace = ? ORDER BY 1", [trace])
+    monitor = Monitor(
+        patterns()[name].text,
+        street("driving", "driving", cut=CUTS[1]),
+        trace=trace,
+        on_event=lambda event: told.append(event.kind),
+    )
+    for graph in store.file.graphs(ids["frame_id"].astype("int64")):
+        monitor.look([graph])
+    monitor.finish()
+
+    assert {"violated", "found"} & {*told}
+
+
+def test_the_number_of_a_chain_is_the_same_in_both_evaluators(store: Store) -> None:
+    rows = store.find(
+        "MATCH (:Ego)-[:isIn]->(l:Lane) RETURN frame.id AS frame, l.id AS lane, l.chain AS chain"
+    )
+    told = {(int(row.frame), int(row.lane)): row.chain for row in rows}
+    frames = np.array(sorted({frame for frame, _ in told})[::50])
+    views = {int(graph.frame_id): FrameView(graph) for graph in store.file.graphs(frames)}
+
+    assert any(lane != chain for (_, lane), chain in told.items())
+    for (frame, lane), chain in told.items():
+        assert frame not in views or views[frame].chain_of(lane) == chain
