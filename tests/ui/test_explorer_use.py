@@ -43,6 +43,17 @@ def assert_one_column(page: Any) -> None:
             assert whole <= width
 
 
+CUT_OFF: Final = """() => [...document.querySelectorAll("select, input, button, label")].filter(one => {
+  const {right, width} = one.getBoundingClientRect();
+  return width && right > innerWidth && !one.closest("table, .matrix");
+}).map(one => one.outerHTML.slice(0, 80))"""
+"""Controls that end outside the window."""
+
+SMALL_TEXTS: Final = """() => [...document.querySelectorAll(".chart text")].filter(
+  one => one.getBoundingClientRect().height < 10).map(one => one.textContent)"""
+"""Texts of a chart that are too small to be read."""
+
+
 def test_narrow_window_has_one_column(
     page: Any, visit: Callable[..., Any], town_store: Path, tmp_path: Path
 ) -> None:
@@ -53,6 +64,8 @@ def test_narrow_window_has_one_column(
         page.locator(sign).first.wait_for()
         assert page.evaluate("document.documentElement.scrollWidth") <= 390
         assert page.locator(sign).first.bounding_box()["width"] <= 390
+        assert page.evaluate(CUT_OFF) == []
+        assert page.evaluate(SMALL_TEXTS) == []
     search(page, f"{NEAR} WHERE e.speed > 3")
     open_first(page)
     page.get_by_role("button", name="legend").click()
@@ -121,6 +134,8 @@ def test_no_view_has_a_serious_fault_of_accessibility(page: Any) -> None:
     page.locator(".tile input").first.check()
     page.locator(".tile").nth(1).wait_for()
     open_first(page)
+    expect(page.locator(".conditions .values")).to_have_text(re.compile("m/s$"))
+    assert faults(page) == []
     for tab in ("neighbours", "nodes", "edges"):
         page.get_by_role("tab", name=tab).click()
         page.locator(".pattern .scroll").wait_for()

@@ -62,7 +62,7 @@ function Clips({ all }) {
       const match = /** @type {Match} */ (all[at]), [start, end] = timesOf(match);
       return html`<div class="clip" role="listitem" key=${keyOf(match)} style=${{ top: `${at * ROW}px` }}
           aria-posinset=${at + 1} aria-setsize=${all.length}><span class="cut">${match.trace}</span>
-        <span class="number">${seconds(start)} s</span><span class="number">– ${seconds(end)} s</span>
+        <span class="number">${seconds(start)} s – ${seconds(end)} s</span>
         <button class="small" onClick=${() => { view.value = "find"; openMatch(match); }}>open</button>
         <button class="small" onClick=${(/** @type {MouseEvent} */ event) => {
           gone.current = event.detail === 0; // by a key
@@ -102,16 +102,17 @@ function Keep() {
         : `${found.files.length} files in ${found.folder}${lost}`);
     } catch (error) { tell(reasonOf(error)); }
   };
+  const choice = html`<label>as <select name="format" value=${format}
+    onChange=${(/** @type {{target: HTMLInputElement}} */ e) => setFormat(e.target.value)}>
+    ${FORMATS.map((f) => html`<option>${f}</option>`)}</select></label>`;
   return html`<form class="row wrap" onSubmit=${write}>
       <label>Name <input name="name" required pattern="[^\\/\\\\.][^\\/\\\\]*" value=${name}
         onInput=${(/** @type {{target: HTMLInputElement}} */ e) => setName(e.target.value)} /></label>
       <button class="main" value="download" title="a file with the clips and their checksums">Download a lock</button>
-      ${writing ? html`<button value="lock">Write a lock</button>` : null}
-      <label>as <select name="format" value=${format}
-        onChange=${(/** @type {{target: HTMLInputElement}} */ e) => setFormat(e.target.value)}>
-        ${FORMATS.map((f) => html`<option>${f}</option>`)}</select></label>
-      ${writing ? html`<button value="export">Export clips</button>` : null}</form><p role="status">${made}</p>
-    <p class="row wrap"><span class="faint">Cut the clips out with the downloaded lock:</span> <code>${command}</code>
+      ${writing ? html`<button value="lock">Write a lock</button>
+        <button value="export">Export clips</button>${choice}` : null}</form><p role="status">${made}</p>
+    <p class="row wrap"><span class="faint">Cut the clips out with the downloaded lock:</span>
+      ${writing ? null : choice} <code>${command}</code>
       ${" "}<button class="small" onClick=${() => copy(command, "command copied")}>Copy</button></p>
     ${writing ? null : html`<p class="faint">With <code>sgstore serve … --write-to DIR</code>, this page exports the
       clips itself.</p>`}`;

@@ -60,6 +60,10 @@ export function Table({ table, most = 200 }) {
     ${table.of > most ? html`<p class="faint">${most} of ${table.of.toLocaleString("en")} rows</p>` : null}`;
 }
 
+/** Whether the window is that of a phone. */
+const phone = matchMedia("(max-width: 520px)"), narrow = signal(phone.matches);
+phone.addEventListener("change", () => { narrow.value = phone.matches; });
+
 /** Whether axes are logarithmic. */
 const logarithmic = signal(true);
 
@@ -82,23 +86,24 @@ function Chart({ table, x, lines }) {
   const scale = (/** @type {number} */ v, /** @type {number} */ from,
     /** @type {number} */ to) => (log ? Math.log(Math.max(v, from) / from) / Math.log(to / from || 1)
     : (v - from) / (to - from)) || 0;
-  const px = (/** @type {number} */ v) => 56 + scale(v, left, right) * 830,
+  const wide = narrow.value ? 430 : 900; // so that its text can be read
+  const px = (/** @type {number} */ v) => 56 + scale(v, left, right) * (wide - 70),
     py = (/** @type {number} */ v) => 206 - scale(v, low, top) * 170;
   const colours = ["var(--accent)", "var(--ego)"], said = (/** @type {number} */ v) => v.toLocaleString("en",
     { maximumFractionDigits: v < 10 ? 1 : 0 });
   return html`<label class="row"><input type="checkbox" checked=${log}
     onChange=${() => { logarithmic.value = !log; }} /> logarithmic axes</label>
-    <svg class="chart" viewBox="0 0 900 240" role="img" aria-label=${`${lines.map(headOf).join(" and ")} by ${x}, ${log
+    <svg class="chart" viewBox=${`0 0 ${wide} 246`} role="img" aria-label=${`${lines.map(headOf).join(" and ")} by ${x}, ${log
       ? "logarithmic" : "linear"} axes`}>
-    ${ticksOf(low, top, log).map((v) => html`<line class="axis" x1="56" x2="886" y1=${py(v)} y2=${py(v)} />
+    ${ticksOf(low, top, log).map((v) => html`<line class="axis" x1="56" x2=${wide - 14} y1=${py(v)} y2=${py(v)} />
       <text class="axis-text" x="50" y=${py(v) + 4} text-anchor="end">${said(v)}</text>`)}
-    ${ticksOf(left, right, log).map((v) => html`<text class="axis-text" x=${px(v)} y="221" text-anchor="middle">
+    ${ticksOf(left, right, log).map((v) => html`<text class="axis-text" x=${px(v)} y="224" text-anchor="middle">
       ${said(v)}</text>`)}
     ${all.map((ys, k) => html`<polyline class="series" style=${{ stroke: colours[k] }}
       points=${ys.map((/** @type {number} */ v, /** @type {number} */ i) => `${px(xs[i])},${py(v)}`).join(" ")} />
       <text x=${56 + k * 150} y="18" font-size="12" font-weight="600" fill=${colours[k]}>
         ${headOf(lines[k] || "")}</text>`)}
-    <text class="axis-text" x="470" y="236" text-anchor="middle">${x}</text></svg>`;
+    <text class="axis-text" x=${wide / 2 + 20} y="242" text-anchor="middle">${x}</text></svg>`;
 }
 
 /** Something that takes a while: asks once, and says what came of it; what is not looked at any more ends.
