@@ -229,7 +229,7 @@ def _of_violation(one: ViolationInterval) -> tuple[Any, ...]:
 
 def _as_violation(values: Sequence[Any]) -> ViolationInterval:
     *about, runs = values
-    return ViolationInterval(*about, tuple(Interval(*run) for run in runs))
+    return ViolationInterval(*about, false_runs=tuple(Interval(*run) for run in runs))
 
 
 def _values_of(verdict: Verdict) -> list[Any]:

@@ -989,7 +989,9 @@ def _violation(
     return ViolationInterval(*_extent(trace, start, end), dict(values), runs)
 
 
-def _extent(trace: TraceReader, start: int, end: int) -> tuple[Any, ...]:
+def _extent(
+    trace: TraceReader, start: int, end: int
+) -> tuple[str, int, int, int, int, float, float, int]:
     """Return the fields of an interval before its values."""
     (first, last), (begin, stop) = trace.numbers[[start, end]], trace.times[[start, end]]
     seqs_ns = int(first), int(last), int(begin), int(stop)
