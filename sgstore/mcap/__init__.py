@@ -31,7 +31,7 @@ from sgstore.mcap._fetch import (
     read_and_digest,
     remote_names,
 )
-from sgstore.mcap._findings import MAX_LOSSES, Findings, Loss, Passes
+from sgstore.mcap._findings import MAX_LOSSES, Findings, Loss
 from sgstore.mcap._order import OutOfOrder
 from sgstore.mcap._read_ahead import MAGIC, read_summary
 from sgstore.mcap._reader import CLIP, RUN_MESSAGES, McapFile
@@ -58,7 +58,6 @@ __all__ = [
     "McapFile",
     "Messages",
     "OutOfOrder",
-    "Passes",
     "RecordPlace",
     "Recording",
     "Records",

@@ -207,7 +207,7 @@ def _read(
                 setattr(found, name, value)
             found.frames, found.states, found.seconds = tally.frames, report.states, tally.seconds
             found.unknown_types = config.unknown_of(report.unknown_types)
-            implausible = tally.checked.findings(report.losses, report.passes)
+            implausible = tally.checked.findings(report)
             found.implausible = [one.as_dict() for one in implausible]
             known = [one.value for one in implausible]
             found.warnings = [*odd, *(one for one in report.warnings if one not in known)]

@@ -21,6 +21,7 @@ import numpy as np
 
 from sgstore.base.display import number_of
 from sgstore.graphs.online import entities_of
+from sgstore.mcap import Findings
 from sgstore.model.vocabulary import (
     DRIVING,
     KIND_CODE,
@@ -52,7 +53,7 @@ if TYPE_CHECKING:
 
     from sgstore.graphs.online import Entity, Frame
     from sgstore.maps.roads import RoadMap
-    from sgstore.mcap import Loss, Passes
+    from sgstore.mcap import Loss
     from sgstore.model.world import Bools, Floats, Ints
 
 JUMP: Final = 2.5
@@ -340,17 +341,17 @@ class Plausibility:
             )
         )
 
-    def findings(self, losses: Sequence[Loss] = (), passes: Passes | None = None) -> list[Finding]:
+    def findings(self, report: Findings | None = None) -> list[Finding]:
         """Return the implausible data, one finding for each kind. Call it once, after the last block.
 
         Parameters
         ----------
-        losses : sequence of Loss
-            Losses of the reader. Values that are impossible alone are among them.
-        passes : Passes, optional
-            Parts of the recording with the same log times. Findings that begin among their mixed frames are
-            replaced by one with the reason.
+        report : Findings, optional
+            Report of the reader. Values that are impossible alone are among its losses. If passes of the
+            recording are mixed, one finding with the reason replaces those that begin among mixed frames.
         """
+        report = report or Findings()
+        losses, passes = report.losses, report.passes
         contradicting = sum(vote.rows for vote in self._tally.votes.values())
         found = [
             self._finding(one.kind, one.node, one.frame, one.nodes, one.rows, one.value)

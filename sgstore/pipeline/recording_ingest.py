@@ -623,7 +623,7 @@ class SegmentReader:
         if self._job.config.topics:
             report.losses += self._keep_topics(trace, segments)
         moot = [*report.about_ego] if egos else []
-        found = tally.checked.findings(report.losses, report.passes)
+        found = tally.checked.findings(report)
         moot += [one.value for one in found]
         warnings = [warning for warning in report.warnings if warning not in moot]
         warnings += [str(one) for one in found if not (egos and one.kind == "ego missing")]

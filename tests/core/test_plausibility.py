@@ -46,7 +46,7 @@ def found_in(flavour: str, of: Drive, folder: Path, size: int = 25) -> list[Find
     with open_trace(WRITERS[flavour](of, folder / "x.mcap")) as trace:
         for block in trace.blocks(size):
             checked.see(block)
-        return checked.findings(trace.report.losses)
+        return checked.findings(trace.report)
 
 
 @cache
@@ -260,7 +260,7 @@ def test_good_recordings_raise_no_alarm(data: Path) -> None:
             checked = Plausibility(road_map)
             for block in trace.blocks(120):
                 checked.see(block)
-            found = checked.findings(trace.report.losses)
+            found = checked.findings(trace.report)
         if found:
             alarms[str(path.relative_to(data))] = [one.kind for one in found]
 
