@@ -93,7 +93,8 @@ function Chart({ table, x, lines }) {
     { maximumFractionDigits: v < 10 ? 1 : 0 });
   return html`<label class="row"><input type="checkbox" checked=${log}
     onChange=${() => { logarithmic.value = !log; }} /> logarithmic axes</label>
-    <svg class="chart" viewBox=${`0 0 ${wide} 246`} role="img" aria-label=${`${lines.map(headOf).join(" and ")} by ${x}, ${log
+    <svg class="chart" viewBox=${`0 0 ${wide} 246`} role="img"
+      aria-label=${`${lines.map(headOf).join(" and ")} by ${x}, ${log
       ? "logarithmic" : "linear"} axes`}>
     ${ticksOf(low, top, log).map((v) => html`<line class="axis" x1="56" x2=${wide - 14} y1=${py(v)} y2=${py(v)} />
       <text class="axis-text" x="50" y=${py(v) + 4} text-anchor="end">${said(v)}</text>`)}
