@@ -43,12 +43,10 @@ def graph_page(graph: nx.MultiDiGraph[Any], title: str, subtitle: str) -> Page:
     egos = {node for node in graph if _class(graph, node) in _EGO}
     for ends in sorted({tuple(sorted(pair, key=str)) for pair in labels}, key=str):
         of_ego = not egos.isdisjoint(ends)
-        look = {
-            "color": palette.EGO if of_ego else palette.FAINT_INK,
-            "alpha": 0.9 if of_ego else 0.35,
-        }
+        color, alpha = (palette.EGO, 0.9) if of_ego else (palette.FAINT_INK, 0.35)
         (x, y), (u, v) = (spots[end] for end in ends)
-        page.add(page.sheet, Line2D([x, u], [y, v], linewidth=0.8, zorder=1, **look))
+        line = Line2D([x, u], [y, v], linewidth=0.8, zorder=1, color=color, alpha=alpha)
+        page.add(page.sheet, line)
     for node, (x, y) in spots.items():
         _paint_node(page, graph, node, (x, y), is_ego=node in egos)
     _paint_list(page, graph, labels, egos)

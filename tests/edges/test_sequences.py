@@ -191,7 +191,12 @@ def test_no_fewer_clips_keep_all_sequences(drives: Store) -> None:
 def test_no_fewer_clips_keep_all_classes_and_all_manoeuvres(
     drives: Store, abstraction: str, combos: int
 ) -> None:
-    both = {"classes": True, "combos": combos, "sequences": 1, "manoeuvres": (*THREE,)}
+    both: dict[str, Any] = {
+        "classes": True,
+        "combos": combos,
+        "sequences": 1,
+        "manoeuvres": (*THREE,),
+    }
     spec = SelectionSpec(Strategy.minimal, SelectionUnit.clip, 2.0, abstraction, **both)
     chosen = ChosenFrames("all", drives)
 

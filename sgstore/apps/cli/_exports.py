@@ -128,7 +128,10 @@ def _write(written: Sequence[WrittenClip | WrittenFile], out: PrintedRows) -> No
 
 def _say_context(written: Sequence[WrittenClip | WrittenFile]) -> None:
     """If clips begin with messages from before their start, such as the map, print a note about them."""
-    early = [one.start_ns - one.first_ns for one in written if getattr(one, "context", 0)]
+    from sgstore.exporters import WrittenClip
+
+    clips = [one for one in written if isinstance(one, WrittenClip) and one.context]
+    early = [one.start_ns - one.first_ns for one in clips]
     if early and max(early) > 0:
         say(
             f"{len(early)} of {number_of(len(written), 'clip')}: the first messages are context, such as the"

@@ -171,7 +171,7 @@ class _Cast:
             if stepped
             else (interval.start_seq, interval.start_ns)
         )
-        return int(frame_ids(trace, seq)), time, f"{name}({', '.join(kinds)})"
+        return int(frame_ids(trace, np.array(seq))), time, f"{name}({', '.join(kinds)})"
 
 
 def sequences_in(code: Ints, time_ns: Ints, names: int, k: int, within_ns: int) -> dict[int, int]:
