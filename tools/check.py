@@ -52,7 +52,7 @@ TESTS = {
     "mcap": "mcap_* ahead order",
     "numba_loops": "compiled",
     "opendrive": "opendrive_*",
-    "pair_numbers": "pair_numbers ttc criticality lane_dist lane_places lane_courses roundabouts",
+    "pair_numbers": "pair_numbers ttc criticality lane_dist lane_places lane_courses lane_chains roundabouts",
     "processes": "processes ingest_many sandbox",
     "plugins": "plugins relations abstractions flavours",
     "query": "query api datasets",
@@ -74,8 +74,8 @@ TESTS = {
     "online": "online identity",
     "online_noise": "noise online",
     "store": "everyday store store_* topics topics_travel doors events world_rows fault_messages",
-    "temporal": "temporal monitor over_time check_verdicts happens step_expressions robustness shrink"
-    " windows tolerance clock",
+    "temporal": "temporal monitor over_time check_verdicts violations happens step_expressions robustness"
+    " shrink windows tolerance clock",
     "trace_sampling": "ingest",
     "truth_lanes": "parts timeline",
     "vocabulary": "kinds",

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import csv
 import io
+import random
 import tarfile
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from formulas import OnlineFormula, formula_of, prefix_verdicts
-from oracle_temporal import try_formulas
+from oracle_temporal import NAMES, holds, random_formula, random_word, try_formulas
 from thorough import LONG
 
 from sgstore.errors import QueryError
 from sgstore.temporal import evaluate
-from sgstore.temporal._formula import And, Next, Not, eventually
+from sgstore.temporal._formula import And, Next, Not, always, eventually
+from sgstore.temporal._quantifiers import number_of_bindings
 from sgstore.temporal._verdicts import PRESUMABLY_TRUE, Settled
 
 if TYPE_CHECKING:
@@ -253,3 +256,37 @@ def test_every_verdict_that_sgsm_published_is_a_status(published: list[Published
         verdicts += len(statuses)
 
     assert verdicts == 336_911 if LONG else verdicts > 60_000
+
+
+@pytest.mark.parametrize("first", range(0, 20_000, 500) if LONG else (0,))
+def test_random_conditions_are_false_where_the_textbook_says(first: int) -> None:
+    open_ones = 0
+    for seed in range(first, first + 500):
+        rng = random.Random(seed)
+        body, (word, times) = random_formula(rng, 3), random_word(rng)
+        columns = {name: np.array([letter[name] for letter in word]) for name in NAMES}
+        settled = Settled(always(body), columns, np.array(times, np.int64))
+
+        found = [settled.false_frames(end) for end in ("strong", "bounded", "weak")]
+
+        strong, bounded, weak = (one for one in found if one is not None)
+        assert strong.tolist() == [not holds(body, word, times, i) for i in range(len(word))]
+        assert not (weak & ~bounded).any()
+        for _ in range(3):  # later frames change nothing that is certain
+            more, gaps = random_word(rng)
+            after = [times[-1] + 1 + time - gaps[0] for time in gaps]
+            for i in np.flatnonzero(weak).tolist():
+                assert not holds(body, [*word, *more], [*times, *after], i), (seed, i)
+        open_ones += int((strong & ~weak).sum())
+    assert open_ones > 50
+
+
+@pytest.mark.parametrize("seed", range(200 if LONG else 20))
+def test_combinations_of_entities_are_counted_as_they_are_listed(seed: int) -> None:
+    rng = random.Random(seed)
+    domains = [{n for n in range(5) if rng.random() < 0.6} for _ in range(rng.randint(1, 4))]
+    every = [*product(*domains)]
+
+    assert number_of_bindings(domains, injective=False) == len(every)
+    apart = [one for one in every if len({*one}) == len(one)]
+    assert number_of_bindings(domains, injective=True) == len(apart)

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import json
 import random
-from itertools import groupby, product
+from itertools import groupby
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
-import numpy as np
 import pytest
-from oracle_temporal import NAMES, holds, random_formula, random_word
 from recordings import Recorder
 from recordings import car as recorded
 from thorough import LONG
@@ -18,10 +16,6 @@ from thorough import LONG
 import sgstore
 from sgstore.apps.cli import run
 from sgstore.ingest import ingest
-from sgstore.temporal import _offline
-from sgstore.temporal._formula import always
-from sgstore.temporal._quantifiers import number_of_bindings
-from sgstore.temporal._verdicts import Settled
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -182,29 +176,6 @@ def test_violations_of_the_same_frames_unite_the_false_runs_of_all_witnesses(
     assert told(whole.false_runs) == [(5, 9, 5), (20, 39, 20)]
 
 
-@pytest.mark.parametrize("first", range(0, 20_000, 500) if LONG else (0,))
-def test_random_conditions_are_false_where_the_textbook_says(first: int) -> None:
-    open_ones = 0
-    for seed in range(first, first + 500):
-        rng = random.Random(seed)
-        body, (word, times) = random_formula(rng, 3), random_word(rng)
-        columns = {name: np.array([letter[name] for letter in word]) for name in NAMES}
-        settled = Settled(always(body), columns, np.array(times, np.int64))
-
-        found = [settled.false_frames(end) for end in ("strong", "bounded", "weak")]
-
-        strong, bounded, weak = (one for one in found if one is not None)
-        assert strong.tolist() == [not holds(body, word, times, i) for i in range(len(word))]
-        assert not (weak & ~bounded).any()
-        for _ in range(3):  # later frames change nothing that is certain
-            more, gaps = random_word(rng)
-            after = [times[-1] + 1 + time - gaps[0] for time in gaps]
-            for i in np.flatnonzero(weak).tolist():
-                assert not holds(body, [*word, *more], [*times, *after], i), (seed, i)
-        open_ones += int((strong & ~weak).sum())
-    assert open_ones > 50
-
-
 # Checks that never applied ----------------------------------------------------------------------------
 
 
@@ -257,7 +228,7 @@ def test_a_true_verdict_tells_how_often_the_check_applied(
 def test_a_premise_refuses_no_check(
     applying: Store, monkeypatch: pytest.MonkeyPatch, premise: str, applied: int | None
 ) -> None:
-    monkeypatch.setattr(_offline, "MOST_BINDINGS", 4)
+    monkeypatch.setattr("sgstore.temporal._offline.MOST_BINDINGS", 4)
 
     (verdict,) = applying.check(
         f"CHECK FORALL (v:Car, w:Car) ALWAYS ({premise} IMPLIES dist(v, w) > 1)"
@@ -270,17 +241,6 @@ def test_a_false_verdict_has_no_count(applying: Store) -> None:
     (verdict,) = applying.check("CHECK ALWAYS (ego.speed > 10 IMPLIES ego.speed > 15)")
 
     assert (verdict.applied_frames, verdict.bindings, verdict.never_applied) == (None, None, "")
-
-
-@pytest.mark.parametrize("seed", range(200 if LONG else 20))
-def test_combinations_of_entities_are_counted_as_they_are_listed(seed: int) -> None:
-    rng = random.Random(seed)
-    domains = [{n for n in range(5) if rng.random() < 0.6} for _ in range(rng.randint(1, 4))]
-    every = [*product(*domains)]
-
-    assert number_of_bindings(domains, injective=False) == len(every)
-    apart = [one for one in every if len({*one}) == len(one)]
-    assert number_of_bindings(domains, injective=True) == len(apart)
 
 
 def test_check_prints_which_rules_never_applied(

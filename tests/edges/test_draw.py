@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree as ET
 
 import matplotlib as mpl
+import networkx as nx
 import numpy as np
 import pytest
 import shapely
@@ -18,6 +19,7 @@ from PIL import Image
 
 import sgstore.draw._palette as palette
 from sgstore.draw import draw_frame, draw_map
+from sgstore.draw._abstraction import _spots
 from sgstore.draw._page import MOST_CHANGE
 from sgstore.draw._picture import title_of
 from sgstore.draw._scene import DrawnFrame
@@ -536,3 +538,16 @@ def test_a_line_between_matched_lanes_lies_where_no_entity_is_near(tmp_path: Pat
     assert math.dist(*ends) == pytest.approx(3.5, abs=0.1)  # from middle to middle
     for body in scene.bodies.values():
         assert min(math.dist((body.x, body.y), end) for end in ends) >= 12.0
+
+
+@pytest.mark.parametrize("others", [1, 2, 8, 9])
+def test_no_line_of_the_ring_passes_the_ego(others: int) -> None:
+    graph = nx.MultiDiGraph()
+    graph.add_node("ego", name="ego", base_class="ego")
+    graph.add_nodes_from((f"car_{i}", {"base_class": "car"}) for i in range(others))
+    spots = _spots(graph)
+    x, y = spots.pop("ego")
+
+    for a, b in ((a, b) for a in spots.values() for b in spots.values() if a < b):
+        cross = (a[0] - x) * (b[1] - y) - (a[1] - y) * (b[0] - x)
+        assert abs(cross) > 1.0

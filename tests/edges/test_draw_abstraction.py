@@ -10,7 +10,6 @@ import pytest
 
 from sgstore.apps.cli import run
 from sgstore.draw import draw_graph
-from sgstore.draw._abstraction import _spots
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -47,19 +46,6 @@ def test_the_picture_has_the_nodes_and_the_edges_of_the_abstraction(
             if (str(graph.nodes[a]["name"])[:20], str(graph.nodes[b]["name"])[:20]) == (src, dst)
         ]
         assert sorted(labels) == words.split(", ")
-
-
-@pytest.mark.parametrize("others", [1, 2, 8, 9])
-def test_no_line_of_the_ring_passes_the_ego(others: int) -> None:
-    graph = nx.MultiDiGraph()
-    graph.add_node("ego", name="ego", base_class="ego")
-    graph.add_nodes_from((f"car_{i}", {"base_class": "car"}) for i in range(others))
-    spots = _spots(graph)
-    x, y = spots.pop("ego")
-
-    for a, b in ((a, b) for a in spots.values() for b in spots.values() if a < b):
-        cross = (a[0] - x) * (b[1] - y) - (a[1] - y) * (b[0] - x)
-        assert abs(cross) > 1.0
 
 
 def test_an_empty_graph_is_an_empty_picture(tmp_path: Path) -> None:

@@ -393,10 +393,10 @@ def failures_(
     novel
         List the novel failures.
     """
-    from sgstore.testsets.coverage import S3C_THRESHOLD, failures, read_outcomes
+    from sgstore.testsets.coverage import failures, read_outcomes
 
-    limits = S3C_THRESHOLD if threshold is None else _fraction(threshold)
-    told = read_outcomes(outcomes, limits)
+    limits = () if threshold is None else (_fraction(threshold),)
+    told = read_outcomes(outcomes, *limits)
     known, tested = windows.of(ask, train, test)
     shares, listed = failures(known, tested, told)
     if novel:

@@ -31,12 +31,7 @@ from sgstore.testsets.coverage._compare import (
     venn,
 )
 from sgstore.testsets.coverage._differences import explain
-from sgstore.testsets.coverage._failures import (
-    S3C_THRESHOLD,
-    failures,
-    read_outcomes,
-    told_outcomes,
-)
+from sgstore.testsets.coverage._failures import failures, read_outcomes, told_outcomes
 from sgstore.testsets.coverage._features import Combinations, combos, features
 from sgstore.testsets.coverage._frames import ReportTable, of_unknown
 from sgstore.testsets.coverage._iso34502 import iso34502
@@ -51,7 +46,6 @@ from sgstore.testsets.coverage._sequences import (
 from sgstore.testsets.coverage._slots import Specification, slot_coverage, specification
 
 __all__ = [
-    "S3C_THRESHOLD",
     "UNKNOWN",
     "WITHIN_S",
     "ChosenFrames",

@@ -418,8 +418,8 @@ def _covering(spec: SelectionSpec, units: Units, rank: Ints, held: Holdings) -> 
     result = _said_of(held, units, spec)
     met = _met(held, units, cover.chosen)
     bound = cover.bound if spec.objective != "units" else round(cover.bound)
-    result |= {"units": len(cover.chosen), "cost": cover.cost, "bound": bound, "exact": cover.exact}
-    result["greedy"] = cover.greedy
+    result |= {"units": len(cover.chosen), "cost": cover.cost, "bound": bound}
+    result |= {"exact": cover.exact, "greedy": cover.greedy}
     said = [
         f"{len(cover.chosen)} of {units.total} {units.unit}s keep all {held.total} {held.kind}"
         + (f", each in {each} {units.unit}s or in all that have it" if each > 1 else ""),
@@ -431,16 +431,10 @@ def _covering(spec: SelectionSpec, units: Units, rank: Ints, held: Holdings) -> 
         )
         + f" (greedy choice alone: {_number(cover.greedy)})",
     ]
-    if spec.strategy is Strategy.minimal and not spec.sequences:
-        clips = " --unit clip" if spec.unit is SelectionUnit.frame else ""
-        said.append(
-            f"{held.kind} are of single frames: a manoeuvre can be lost; keep each one with"
-            f"{clips} --sequences 1 --classes"
-        )
+    said += _lost_by(spec, held)
     if not (cover.exact or has_solver()):
         said.append("a solver could prove the optimum: pip install 'sgstore[solver]'")
-    budget = spec.budget
-    if budget is None:
+    if (budget := spec.budget) is None:
         return Selection(spec, units, cover.chosen, held, result | {"kept": met}, said)
     whole = units.together(cover.chosen, budget.measure)
     if whole <= budget.most * ROUNDING:
@@ -468,6 +462,17 @@ def _covering(spec: SelectionSpec, units: Units, rank: Ints, held: Holdings) -> 
         " with the smallest set that is known",
     ]
     return Selection(spec, units, fitted.chosen, held, result, said)
+
+
+def _lost_by(spec: SelectionSpec, held: Holdings) -> list[str]:
+    """Return a note if a smallest set can lose manoeuvres, with the option that keeps them."""
+    if spec.strategy is not Strategy.minimal or spec.sequences:
+        return []
+    clips = " --unit clip" if spec.unit is SelectionUnit.frame else ""
+    return [
+        f"{held.kind} are of single frames: a manoeuvre can be lost; keep each one with"
+        f"{clips} --sequences 1 --classes"
+    ]
 
 
 def _said_of(held: Holdings, units: Units, spec: SelectionSpec) -> dict[str, Any]:
