@@ -75,7 +75,7 @@ class Valuation:
         *,
         closed: bool = False,
     ) -> tuple[dict[Partial, int], Mapping[Partial, Memory]]:
-        """Process the next frame.
+        """Evaluate all conditions of the plan in the next frame.
 
         Return the true conditions (as bits) and the memory of each partial binding. The query
         results of the frame must be ready.

@@ -600,9 +600,9 @@ class CheckMonitor:
     def _as_sgsm(
         self, entry: _CheckEntry, step: ObligationStep, here: FrameTime, memory: Memory
     ) -> _CheckEntry:
-        """Return the next state of entities. In SGSM mode, a violation lasts while the trace must not end.
+        """Return the state of the check after this frame, for one combination of entities, in SGSM mode.
 
-        In this mode, a violation lasts while the trace must not end.
+        In this mode, a violation lasts as long as the frames so far violate the check.
         """
         since, over = entry.since, entry.over
         if not step.state.ended:

@@ -301,7 +301,7 @@ class CheckPlan(Plan):
     # Conditions on several frames
 
     def _over_frames(self, expression: b.Bound, reading: Reading) -> f.Formula:
-        """Return the formula of a comparison or similar condition that depends on several frames."""
+        """Return the formula of a condition over several frames. Add the test for its unknown values."""
         things = self._things(expression)
         counted = self._counted(things, reading)
         state = self._state(expression)

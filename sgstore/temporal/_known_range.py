@@ -27,7 +27,7 @@ SELECT frame_id >> 24 AS trace_id, max(speed) AS speed FROM known_state GROUP BY
 class ShortRange:
     """Two reasons: why the distance stored around the ego is too small for the verdict true, and for false.
 
-    An empty text means that it can.
+    An empty text means that the verdict is possible.
 
     Attributes
     ----------
@@ -40,12 +40,12 @@ class ShortRange:
     def of(self, *, holds: bool) -> str:
         """Return the reason why the distance stored around the ego is too small for the given verdict.
 
-        An empty text means that it does.
+        An empty text means that the verdict is possible.
         """
         return self.true if holds else self.false
 
     def or_else(self, other: ShortRange) -> ShortRange:
-        """Return the two reasons. An empty reason is replaced by the same reason of ``other``."""
+        """For each verdict, keep the reason why it is impossible. If it is empty, take that of ``other``."""
         return ShortRange(self.true or other.true, self.false or other.false)
 
 

@@ -453,7 +453,7 @@ def premise_of(check: b.BoundCheck) -> b.Bound | None:
 
 
 def plan_of_returned(check: BoundCheck) -> Plan:
-    """Return a new evaluation plan for the ``RETURN`` values of a check, without queries."""
+    """Return an empty evaluation plan for the ``RETURN`` values of a check. The caller adds the queries."""
     return Plan(query_of_check(check), variables_of(check), prefix="returned ")
 
 

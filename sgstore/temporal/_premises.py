@@ -125,7 +125,7 @@ class _Ways:
         self._tests: dict[str, Alternatives] = {}
 
     def ways(self, formula: Formula, *, value: bool) -> Alternatives:  # noqa: PLR0911 - a case each
-        """Return sets of queries. The formula has the value only if all queries of one set have matches."""
+        """Return sets of queries. The formula has ``value`` only if all queries of one set have matches."""
         match formula:
             case TruthConstant(value=constant):
                 return _ALWAYS if constant == value else _NEVER

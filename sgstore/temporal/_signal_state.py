@@ -418,7 +418,7 @@ class StreamClock:
         return self._sorted[(len(self._sorted) - 1) // 2] if self._sorted else 0
 
     def step(self, time_ns: int) -> None:
-        """Add the time of the next frame.
+        """Add the time of the next frame. After a backward jump, shift times so that they ascend.
 
         A time that does not ascend is corrected, as in :func:`sgstore.temporal._offline.ascending`.
         """
@@ -448,7 +448,7 @@ class StreamClock:
         return self.jump or (self.gap and not bridge)
 
     def told(self, time: int) -> int:
-        """Return the recorded time of a frame, from the corrected time that ascends strictly; ns."""
+        """Undo the correction of backward clock jumps: return the recorded time of a frame; ns."""
         after = bisect_right(self._jumps, (time, NEVER, 0))
         return time - self._jumps[after - 1][1] if after else time
 

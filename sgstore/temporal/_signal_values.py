@@ -58,7 +58,7 @@ class Clock:
     def of(
         cls, times: Ints, numbers: Ints, period: int, longest: float, tolerance: int = 0
     ) -> Clock:
-        """Return a clock for frame times.
+        """Return the frame times of a trace, divided into runs at the gaps.
 
         A gap is a time step over ``longest`` (ns) or a skipped frame number.
         """

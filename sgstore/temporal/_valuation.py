@@ -56,7 +56,7 @@ class Lattice:
         return tuple(told)
 
     def wider(self, binding: Partial) -> Iterator[Partial]:
-        """Yield a partial binding, then the bindings with fewer of its nodes, most specific first."""
+        """Yield a partial binding, then bindings with fewer and fewer of its nodes; the empty one is last."""
         if self.size == 1:
             yield binding
             if binding[0] is not None:
