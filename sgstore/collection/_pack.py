@@ -66,7 +66,7 @@ class Commit:
     refused: list[str] = field(default_factory=list[str])
 
     def name(self, before: Snapshot, new: Iterable[tuple[int, str]]) -> dict[int, str]:
-        """Return a unique name for each new trace. Names do not depend on the order in which traces arrive."""
+        """Return and record a unique name for each new trace: trace id → name."""
         taken = {row["name"] for row in before.traces}
         names: dict[int, str] = {}
         for trace_id, name in new:
@@ -364,7 +364,7 @@ def _fetched(
 
 
 def _accepted(waiting: list[_Landed], before: Snapshot, done: Commit) -> list[_Landed]:
-    """Return the segments that can be committed. Record the reason for each rejected segment."""
+    """Return the traces (segments) to add. Record the others in ``done``: present, or refused with a reason."""
     there = {row["trace_id"]: row for row in before.traces}
     by_id: dict[int, list[_Landed]] = {}
     for one in waiting:

@@ -655,7 +655,7 @@ class CollectionMatches(TemporalMatches):
         raise one_store_needed(self._whole.place.url, "bindings are read from one store")
 
     def parts(self, frame: FrameRef, binding: Mapping[str, int] | None = None) -> TruthLanes:
-        """Raise an error: the parts of a pattern can be read only from a single store."""
+        """Raise an error: only a single store can compute when each part of a pattern is true."""
         raise one_store_needed(self._whole.place.url, "parts of a pattern are read from one store")
 
     def numpy(self) -> dict[str, Any]:
@@ -765,7 +765,7 @@ class CollectionUnion(UnionMatches):
 
     @property
     def scope(self) -> dict[str, Any]:
-        """Return which data the ingest settings excluded from the traces of the union, as JSON values."""
+        """Return which data the ingest settings excluded from the traces of a ``UNION``, as JSON values."""
         parts = [part._ready for part in self._parts]  # noqa: SLF001
         chosen = {trace.trace_id for one in parts for trace in one.chosen}
         snapshot = self._parts[0].snapshot
@@ -785,7 +785,7 @@ class CollectionUnion(UnionMatches):
 
     @contextmanager
     def _tables(self) -> Generator[tuple[Any, Any, str, list[Any]]]:
-        """Run each part of the union. Yield the results as tables, and the SQL statement that joins them."""
+        """Run each query of the ``UNION``. Yield the results as tables, and the SQL that joins them."""
         tables, snapshot = dict[str, list[PartFile]](), self._parts[0].snapshot
         with working_folder("union") as folder:
             for number, part in enumerate(self._parts):

@@ -193,7 +193,7 @@ def _kept(path: Path) -> StoreFile:
 
 
 def _tables_of(task: dict[str, Any], held: Path) -> dict[str, Path]:
-    """Return the files of the user tables for a task, by table name."""
+    """Return the file of each user table that a task names. Tables inside the task are written to files."""
     given: dict[str, Path] = {}
     for name, table in task.get("tables", {}).items():
         if table.startswith("base64:"):
