@@ -75,7 +75,7 @@ class GraphFeatures:
         return np.divide(shared, either, out=np.ones(self.frames), where=either > 0)
 
     def digests(self) -> NDArray[np.uint64]:
-        """Return a hash of each frame, (frames,). Frames with equal feature counts have equal hashes."""
+        """Return a hash of each frame's counts of node labels and edges, (frames,); equal for equal counts."""
         hashes = [blake2b(text.encode(), digest_size=8).digest() for text in self.texts]
         mixed = np.frombuffer(b"".join(hashes) or bytes(8), "<u8").astype(np.uint64)
         sums = np.zeros(self.frames, np.uint64)

@@ -96,7 +96,7 @@ def _in_loops(scene: BlockScene) -> bool:
 
 
 def _looking(scene: BlockScene, rows: Rows, codes: Codes) -> Edges:
-    """Return direction edges for some pairs (a, b). An edge begins at b; its direction is seen from a."""
+    """Return edges b → a for some pairs (a, b). The relation of an edge is the direction of b, seen from a."""
     a, b = scene.pairs.some(rows)
     return edges_between(scene, codes, b, a)
 

@@ -186,7 +186,7 @@ class BodyPairs:
 
     @cached_property
     def span(self) -> Floats:
-        """Distances of the first half of the pairs, (K / 2,). For some settings, they are squared (faster)."""
+        """Distance of each pair, once for (a, b) and (b, a), (K / 2,). Squared if not between footprints."""
         half = self._half
         found = np.empty(half)
         for part in even_parts(half):
@@ -251,7 +251,7 @@ class BodyPairs:
 
     @cached_property
     def of_bodies(self) -> Bools:
-        """Mask (K / 2,) of pairs of two solid objects on the same storey. It is empty if all pairs are such."""
+        """Mask of solid pairs on one storey, once for (a, b) and (b, a), (K / 2,). Empty if all are such."""
         of = self._bodies
         plain = not (of.carrier >= 0).any() and not (of.height == 0).any()
         levels = of.low_and_high
