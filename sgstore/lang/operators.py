@@ -47,7 +47,7 @@ class Column:
 
     @property
     def flags(self) -> Bools:
-        """The values, as an array of booleans."""
+        """Values of this column as booleans. Where ``known`` is false, the boolean has no meaning."""
         return np.asarray(self.values, np.bool_)
 
     @property

@@ -51,7 +51,7 @@ class Profile:
 
     @property
     def places(self) -> int:
-        """Number of tables that may store the nodes."""
+        """Number of tables that may store the nodes of the query variable."""
         return sum(map(bool, (self.moving, self.fixed, self.mapped)))
 
     def has(self, home: Home) -> bool:

@@ -102,7 +102,7 @@ ALL_BINDERS: Final[Binders] = {
 
 
 def _node(node: s.NodePattern, names: SymbolTable, *, the_ego: bool = False) -> str:
-    """Return the key of a pattern node. If ``the_ego``, a node with the label ``Ego`` has the key ``ego``."""
+    """Return the key of a node; add a new node to the pattern. ``the_ego``: label ``Ego`` means key ``ego``."""
     kinds = kinds_of(node.label, names.session) if node.label else b.any_kinds()
     if not kinds:
         names.session.refuse("no node can have this label", node.span)
@@ -158,7 +158,7 @@ def _known_node(node: s.NodePattern, names: SymbolTable) -> str | None:
 
 
 def _the_ego(node: s.NodePattern, names: SymbolTable) -> str | None:
-    """If a pattern node has the name ``ego``, return the key of the ego vehicle; otherwise None."""
+    """If a node is named ``ego``, add the ego to the pattern, and return its key; otherwise None."""
     if node.name != THE_EGO:
         return None
     if names.scope.parent is None:

@@ -295,7 +295,7 @@ class UsingChoice:
 
 
 def chosen(settings: Sequence[s.Setting], session: Session, catalog: Catalog) -> UsingChoice:
-    """Return the settings from the ``USING`` clauses of a statement.
+    """Return the settings from the ``USING`` clauses of a statement. The session stores the tolerance.
 
     Raises
     ------

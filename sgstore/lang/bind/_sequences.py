@@ -53,7 +53,7 @@ class StepScope(ScopeBuilder):
     known: dict[str, b.Node] = field(default_factory=dict[str, b.Node])
 
     def mention(self, key: str) -> None:
-        """Record that the step uses a node, which may come from another step."""
+        """Record that this step uses a node of another step. Ignore a node that the step already has."""
         if key not in self.nodes and key in self.known:
             self.nodes[key] = self.known[key]
 
@@ -203,7 +203,7 @@ class _WrittenGroup:
 
     @property
     def rounds(self) -> list[list[_WrittenSteps]]:
-        """Alternatives of the group: a list for each repetition if repetitions have own steps, or one list."""
+        """Alternatives of the group: one list for each repetition if repetitions have own steps, else one."""
         size = len(self.alternatives) // (self.group.high if self.fresh else 1)
         every = self.alternatives
         return [every[first : first + size] for first in range(0, len(every), size)]

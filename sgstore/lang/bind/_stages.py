@@ -51,7 +51,7 @@ class StagedScope(ScopeBuilder):
     ego: str = ""
 
     def the_ego(self, span: TextSpan) -> str:
-        """Return the key of the ego node. The first pattern of the query contains this node."""
+        """Return the key of the ego node. If it is missing, add it to the first pattern of the query."""
         self.ego = self.first.the_ego(span)
         self.nodes.setdefault(self.ego, replace(self.first.nodes[self.ego], role="unnamed"))
         return self.ego

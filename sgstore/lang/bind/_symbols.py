@@ -233,7 +233,7 @@ class ScopeBuilder:
         return self.nodes[key].kinds if key in self.nodes else self.outer[key]
 
     def mention(self, key: str) -> None:
-        """Record that this pattern uses a node, which may come from the pattern around it."""
+        """Record that this pattern in braces uses a node of an outer pattern. Ignore a node of its own."""
         if key in self.nodes or key in self.outer or self.parent is None:
             return
         self.parent.mention(key)

@@ -32,7 +32,7 @@ _LENGTH: Final = re.compile(r"(\d+(?:\.\d+)?)\s*(ms|s|min|frames)", re.IGNORECAS
 
 
 def tense(e: s.Temporal, names: SymbolTable) -> b.Tense:
-    """Resolve a temporal operator such as ``EVENTUALLY``.
+    """Return a temporal operator such as ``EVENTUALLY``, with resolved operands and a checked bound.
 
     Raises
     ------

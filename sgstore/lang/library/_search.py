@@ -108,7 +108,7 @@ def pattern_named(name: str, *, check: bool = False) -> NamedPattern:
 
 
 def _hint_for(name: str, *, check: bool) -> str:
-    """Return a hint for an unknown name: a misspelt name, otherwise patterns with its words."""
+    """Return a hint with the correct name for a misspelt one, otherwise with patterns that have its words."""
     names = [one.name for one in patterns().values() if one.is_check or not check]
     words = [one.name for one in search(name) if one.name in names][:_SUGGESTED]
     near = get_close_matches(name, names, 1, _MISSPELT)

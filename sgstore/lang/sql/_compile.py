@@ -307,7 +307,7 @@ def compile_checks(
 
 
 def _seen(statements: Sequence[object], catalog: Catalog, parameters: Mapping[str, Any]) -> Catalog:
-    """Return the catalog that the ``USING`` settings select by abstraction, dataset and scope."""
+    """Apply the ``USING`` settings of a query to the catalog. The default scope of a ``CHECK`` is ``world``."""
     seen, world = catalog, any(isinstance(one, CheckClause) for one in statements)
     for statement in statements:
         for setting in (

@@ -463,7 +463,7 @@ class _Grouping:
                 return with_operands(value, self._text)
 
     def _number(self, number: Aggregate) -> str:
-        """Return the SQL of an aggregate over a collection, from the results of its stores."""
+        """Return the SQL of an aggregate over a collection. Add the columns that each store must return."""
         if number not in self._known:
             self._known[number] = self._merged(number)
         return self._known[number]
@@ -496,7 +496,7 @@ class _Grouping:
         return name
 
     def _each(self, number: Aggregate) -> str:
-        """Return the SQL column of an aggregate that needs each value (or distinct value) of all stores."""
+        """Return the column of an aggregate that needs all values of all stores. Add the query for them."""
         assert number.operand is not None  # noqa: S101 - COUNT(*) alone has none
         hidden = _Hidden(2_000)
         value = hidden.add(number.operand)
