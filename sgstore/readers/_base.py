@@ -326,7 +326,7 @@ class Survey(Generic[AnyLead]):
         return record.topic, record.message_encoding, *named
 
     def shared_stamps(self, channel: int, stamps: Stamps) -> Stamps:
-        """Return the time stamps of the known channel with the same topic and schema; else ``stamps``."""
+        """If an earlier channel has the same topic and schema, return its time stamps; otherwise ``stamps``."""
         leads = self.leads
         return next((leads[one].stamps for one in self.alike(channel) if one in leads), stamps)
 
@@ -762,7 +762,7 @@ class FramesTrace(MessageTrace):
         return any(channel.role == "ground_truth" for channel in _channels(cls, recording))
 
     def decoder(self, report: TraceReport) -> _FramesDecoder:
-        """Return a new decoder of messages into frames."""
+        """Return a new decoder of messages into frames. Add the losses of the road map to the report."""
         self.start()
         report.losses += self._map_losses.losses()
         return _FramesDecoder(self, self._channels, self._ego, self.recording.window, report)

@@ -595,7 +595,7 @@ class _BlockMaker(Generic[Raw]):
 
     @property
     def left(self) -> int:
-        """Number of frames that are not in a block yet."""
+        """Number of frames that are not yet in a block (frames that are converted together)."""
         return self._count - self._first
 
     def ready(self, known: int) -> Iterator[FrameBlock]:
@@ -616,7 +616,7 @@ class _BlockMaker(Generic[Raw]):
         self._borders.append((self._refs + refs, self._decoder.roster.size))
 
     def block(self, size: int) -> FrameBlock:
-        """Return the next ``size`` frames as a block."""
+        """Remove the next ``size`` frames from the waiting ones, and return them as a block."""
         refs, known = self._borders.popleft()
         before = min(self._first, self._reach)
         window, part = self._done[: before + size + self._reach], (before, size)
@@ -857,7 +857,7 @@ class LifetimeTracker:
             )
 
     def _seconds(self, time_ns: int) -> float:
-        """Return the time since the frame before; s. NaN if there is a gap, or the clock went back."""
+        """Return the time since the frame before; s. After a gap or backward jump, count it; return NaN."""
         last, self._time = self._time, time_ns
         step = 0 if last is None else time_ns - last
         if step < 0:

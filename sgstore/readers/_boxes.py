@@ -163,7 +163,7 @@ class BoxesTrace(FramesTrace):
         return super().decoder(report)
 
     def frame(self, message: TraceMessage) -> Frame:
-        """Convert a frame of the log."""
+        """Convert a message of the log (JSON with boxes) to a frame."""
         told = json.loads(message.data)
         here = {one["id"] for one in told["boxes"]}
         frame = Frame(told["time_ns"], told["ego"] if told["ego"] in here else None)

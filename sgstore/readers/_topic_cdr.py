@@ -315,7 +315,7 @@ class _MessageLayout:
 def _texts(
     data: bytes, size: int, place: int, length: int, rows: NDArray[np.intp], losses: Losses
 ) -> Column:
-    """Return the texts at one position of all given messages. They have the same length."""
+    """Return the texts (of equal length) at one position of messages. Too long ones count as lost."""
     column = np.full(len(rows), "", object)
     if length > MAX_TEXT:
         losses.values += len(rows)

@@ -146,7 +146,7 @@ def _fits(kind: type[np.generic], value: Any) -> bool:
 
 
 def _text(declared: str, value: Any, losses: Losses) -> str | None:
-    """Return a value as the text that the database converts to the type of the field."""
+    """Return a value as text for the database. A value that is too long counts as lost: ``None``."""
     if declared == "VARCHAR":
         found = value if isinstance(value, str) else as_json(value)
     elif declared == "BLOB":

@@ -165,7 +165,7 @@ class AutowareRawFrame:
 
 @dataclass(slots=True)
 class _Detection:
-    """Object without an id of its own in the previous list of detected objects."""
+    """Object of the previous detection message. Detections have no ids, so ``ident`` is assigned."""
 
     ident: str
     label: str

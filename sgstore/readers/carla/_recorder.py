@@ -109,7 +109,7 @@ class CarlaRecorderTrace(FramesTrace):
         return super().decoder(report)
 
     def frame(self, message: TraceMessage) -> Frame:
-        """Convert a frame of the log."""
+        """Convert a message of the log (JSON with actors) to a frame."""
         told = json.loads(message.data)
         egos = {one.get("role"): one for one in reversed(told["actors"])}
         ego = next((egos[role] for role in EGO_ROLES if role in egos), None)

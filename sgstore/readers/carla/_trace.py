@@ -290,7 +290,7 @@ class CarlaDecoder(SurveyedDecoder[CarlaRawFrame, CarlaSurvey]):
             self._people.add(node)
 
     def _other(self, ident: int, classification: float) -> dict[int, Called]:
-        """Return the present kind of an object if its class has changed: node id → kind; otherwise empty."""
+        """If the class of an object differs from its first one, return node id → present kind; else empty."""
         node = self._nodes[ident]
         if np.isnan(self._classes[ident]):
             self._classes[ident] = classification

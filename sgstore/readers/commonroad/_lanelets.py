@@ -283,7 +283,7 @@ def _stops(
     row_of: dict[str, int],
     notes: list[str],
 ) -> dict[int, float]:
-    """Return the position of the stop line along each lane that has a stop line; m."""
+    """Return the position of the stop line along each lane that has one; m. Warn if it is not on its lane."""
     found: dict[int, float] = {}
     told: dict[int, Floats] = {}
     for lanelet in scenario.lanelets.values():

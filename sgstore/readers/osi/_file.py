@@ -301,7 +301,7 @@ class OsiFile(MessageFile):
         raise TraceError(reason, path=self.path)
 
     def _messages(self, report: Findings) -> Iterator[tuple[int, int, bytes]]:
-        """Yield for each message of an OSI file: offset of its zstd frame, offset within it, and bytes."""
+        """Yield messages: offset of the zstd frame, offset within it, and bytes. Report damage as lost."""
         stream = _Stream(self._mark)
         content = pieces(self._file)
         while True:

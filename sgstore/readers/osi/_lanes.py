@@ -275,7 +275,7 @@ class OsiLanes:
         return f"{name}{OF_LANES}" if plain else ""
 
     def _place(self, points: Iterable[Any]) -> Floats:
-        """Return the points of an OSI line as an array (n, 3); m."""
+        """Return the points of an OSI line, (n, 3); m. Too many points in all lines raise an error."""
         line = np.array([(p.x, p.y, p.z) for p in points], np.float64).reshape(-1, 3)
         self._points += len(line)
         if self._points > MAX_POINTS:
@@ -304,7 +304,7 @@ class _LaneBoundaries:
         self._logical: dict[int, tuple[Floats, Floats]] = {}
 
     def physical(self, idents: Iterable[Any]) -> tuple[Border, ...]:
-        """Return the lane borders for ids of physical OSI boundaries. Missing boundaries are left out."""
+        """Return the lane borders for ids of physical OSI boundaries. Record the missing boundaries."""
         found: list[Border] = []
         for ident in map(_number, idents):
             boundary = self.told["lane_boundary"].get(ident)

@@ -42,7 +42,7 @@ class RecordedTrace(FramesTrace):
         return {FRAME: "ground_truth", ROAD_MAP: "map"}.get(channel.schema, "payload")
 
     def map_text(self, message: TraceMessage) -> str:
-        """Return the OpenDRIVE text in a message with the road map."""
+        """Return the OpenDRIVE text in a message with the road map, and store the name of the map."""
         record = self.recording.channels[message.channel.id]
         told = message_class(self.recording.schemas[record.schema_id]).FromString(message.data)
         self._map_name = str(told.map_reference).replace("\\", "/").rpartition("/")[2]

@@ -432,7 +432,7 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
                 self._aside[ident] = self._aside.get(ident, 0) + 1
 
     def _met(self, objects: list[bytes], log_time: int) -> tuple[list[int], list[bytes]]:
-        """Return node ids and bytes of serialised objects. Leave out unreadable objects and duplicates."""
+        """Return node ids and bytes of serialised objects. Unreadable ones and duplicates count as lost."""
         keys = keys_of(objects, self._last_keys)
         if keys is self._last_keys:  # The same objects as in the last frame, in the same order.
             return self._last_nodes.copy(), objects
@@ -523,7 +523,7 @@ class OsiDecoder(SurveyedDecoder[OsiRawFrame, OsiSurvey]):
         return next(ident for ident, known in self._nodes.items() if known == node)
 
     def _usable(self, frame: FrameRows, usable: Bools, ego: int) -> FrameRows:
-        """Return a frame without the rows of objects that are unusable."""
+        """Return a frame without the objects that have no usable pose. Count these as unusable."""
         for node in frame.node[~usable].tolist():
             words = f"moving object {self._number(node)} has no usable pose"
             self._unusable.add(words, frame.log_time_ns)

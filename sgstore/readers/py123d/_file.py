@@ -120,7 +120,7 @@ class Py123dFile(NumberedFile):
 
 
 def _metadata(table: Any, lost: list[str]) -> dict[str, Any]:
-    """Return the metadata that the schema of a file contains; empty if they are damaged."""
+    """Return the metadata in the schema of a file. Damaged metadata are empty, and reported as lost."""
     try:
         told = unpacked((table.schema.metadata or {})[b"metadata"])
         if isinstance(told, dict):
@@ -146,7 +146,7 @@ def _is_time(value: Any) -> bool:
 
 
 def _read_boxes(files: dict[str, Path], lost: list[str]) -> tuple[Boxes, Any]:
-    """Return all boxes of a log, including the ego in each frame, and the time of each box; ns."""
+    """Return all boxes of a log, with the ego, and the time of each box; ns. Report damage as lost."""
     ident: list[str] = []
     kind: list[str] = []
     times: list[int] = []
@@ -284,7 +284,7 @@ def _label_sets() -> dict[str, list[str]]:
 
 
 def _labels(about: dict[str, Any]) -> dict[int, str]:
-    """Return the label names of a data set: number → name. The metadata of boxes name the data set."""
+    """Return the names of box labels: number → name; empty if the metadata name an unknown set of labels."""
     name = str(about.get("box_detection_label_class", "")).rpartition(".")[2]
     return dict(enumerate(_label_sets().get(name, [])))
 

@@ -74,7 +74,7 @@ def read_lanes(table: Any, lost: list[str]) -> Lanes:
 
 
 def _points(told: Any) -> Any:
-    """Return points (n, 3). Repeated points are removed."""
+    """Return the points of a line, (n, 3), without repeated ones. An invalid line raises an error."""
     line = np.asarray(told, np.float64)
     if line.ndim != 2 or line.shape[1] != 3 or not (np.abs(line) < 1e8).all():
         raise ValueError("a line has an impossible point")

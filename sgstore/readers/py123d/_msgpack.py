@@ -49,7 +49,7 @@ def unpacked(data: bytes) -> Any:
 
 
 def _value(data: bytes, at: int, depth: int) -> tuple[Any, int]:
-    """Return the value at a position, and the position after it."""
+    """Return the MessagePack value at a byte position, and the position after the value."""
     code = data[at]
     at += 1
     if code < 0x80 or code >= 0xE0:  # A small number is the code itself.

@@ -98,7 +98,7 @@ class SumoTrace(FramesTrace):
         self._guessed: set[str] = set()
 
     def decoder(self, report: TraceReport) -> Any:
-        """Return a new decoder of frames. Report vehicle types without a size."""
+        """Return a new decoder. Keep the list of warnings: reading adds vehicle types without a size to it."""
         found = super().decoder(report)
         self._warnings = report.warnings
         return found
