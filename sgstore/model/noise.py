@@ -356,7 +356,7 @@ class GapFiller:
     apart: Ints = field(default_factory=lambda: np.zeros(5001, np.int64))
 
     def second(self, values: Floats, found: Floats) -> list[Mapping[str, float] | None]:
-        """Return motion computed from positions as extra attributes, for rows with recorded velocity."""
+        """Compute motion from positions where velocity is recorded, else ``None``. Count speed differences."""
         added: list[Mapping[str, float] | None] = [None] * len(values)
         rows = np.flatnonzero(np.isfinite(values[:, _VELOCITY]))
         if not len(rows):
@@ -381,7 +381,7 @@ class GapFiller:
     def filled(
         self, values: Floats, found: Floats, fixed: Bools, stands: Bools
     ) -> tuple[Floats, Ints]:
-        """Fill in missing motion of bodies. Return the values, and bits that mark computed quantities."""
+        """Fill in missing motion, but no impossible values. Return the values, and bits of computed ones."""
         wanted, derived = values.copy(), np.zeros(len(values), np.int64)
         for bit, (column, first, width) in enumerate(
             ((_VELOCITY, 0, 3), (_ACCELERATION, 3, 3), (_YAW_RATE, 6, 1))
