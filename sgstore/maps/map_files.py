@@ -193,7 +193,7 @@ class Maps:
         return self._read[text]
 
     def _named(self, name: str, warnings: list[str]) -> RoadMap | None:
-        """Return the map from the file of that name in the folder: ``Carla/Maps/Town01`` is ``Town01.xodr``."""
+        """Read the map file for a name: ``Town01.xodr`` for ``Carla/Maps/Town01``. Without one, warn."""
         if self.folder is None:
             return None
         stem = PurePosixPath(name.replace("\\", "/")).name.removesuffix(OF_LANES)

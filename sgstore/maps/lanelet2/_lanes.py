@@ -89,7 +89,7 @@ _AREAS: Final = {"building": "building", "vegetation": "vegetation", "traffic_is
 
 
 def _areas(document: OsmDocument) -> list[PlainObject]:
-    """Return areas without traffic (such as buildings) of a Lanelet2 map, each as an outline."""
+    """Return outlines of areas such as buildings in a Lanelet2 map. Other areas cause a warning."""
     found: list[PlainObject] = []
     left: Counter[str] = Counter()
     broken: list[str] = []

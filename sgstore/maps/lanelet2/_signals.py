@@ -121,7 +121,7 @@ def plain_signals(
 
 
 def _standing(name: str, kind: str, line: Floats) -> PlainSignal:
-    """Return a traffic light, sign or stop line that lies at a given line."""
+    """Make a traffic light, sign or stop line from its line on the map. A very short line is extended."""
     x, y, z = map(float, line.mean(axis=0))
     flat = line[:, :2]
     if run_of(line)[-1] < SHORTEST:

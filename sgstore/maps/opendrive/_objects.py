@@ -304,7 +304,7 @@ def _corners(document: Document, tag: str, names: tuple[str, str]) -> dict[int, 
 def _items(
     outlines: _Outlines, repeats: dict[int, list[_Repeat]], rows: list[int], warnings: list[str]
 ) -> _Items:
-    """Return all copies of some OpenDRIVE objects, one row each, with outlines."""
+    """Return all copies of some OpenDRIVE objects, with outlines. Warn about objects that are too large."""
     items = _Items()
     own = outlines.own
     for row in rows:
