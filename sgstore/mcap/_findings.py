@@ -56,7 +56,7 @@ class Passes:
 
     @property
     def reason(self) -> str:
-        """The fault and its place, as text."""
+        """Text of the fault for a report: by how much and where the log clock steps back."""
         back = f"{(self.end_ns - self.start_ns) / 1e9:.3g} s"
         return (
             f"the log clock steps back by {back} before message {self.number} of {self.topic}:"

@@ -178,7 +178,7 @@ def published(log_time: Ints, publish_time: Times, channel: NDArray[Any]) -> Tim
 
 
 class _Step(NamedTuple):
-    """Step back in the log times of a channel.
+    """Step of a channel's log times back to an earlier time.
 
     ``start_ns``, ``end_ns``: log times after and before it. ``message``, ``number``: number of the message
     after it in the file, from 0, and in its channel, from 1.
@@ -207,7 +207,7 @@ class OrderCheck:
         self._channel = np.zeros(0, np.int64)
 
     def follows(self, run: Messages) -> bool:
-        """Return True if a group of messages is sorted by time and follows all earlier groups."""
+        """Return True if a group of messages is sorted and follows all earlier groups. Remember its end."""
         log = np.concatenate([self._log, run.log_time_ns])
         steps = np.diff(log)
         if (steps < 0).any():
@@ -318,7 +318,7 @@ class TimeOrder:
         self._passes = self._mixed(ranks)
 
     def _mixed(self, ranks: ChannelRanks) -> Passes | None:
-        """Return the passes of the file if their messages are mixed in order of time."""
+        """If sorting by time mixes the passes of a file (parts with the same log times), return the passes."""
         steps = [one for of_channel in self._steps.values() for one in of_channel]
         if not steps or max(map(len, self._steps.values())) >= MOST_PASSES:
             return None

@@ -425,7 +425,7 @@ class McapFile:
             yield from self._flush(walk)
 
     def _flush(self, walk: _FileWalk) -> Iterator[Messages]:
-        """Yield the messages outside chunks that were found since the last call."""
+        """Yield the messages outside chunks found since the last call. Unreadable ones count as lost."""
         if not walk.run:
             return
         offsets = np.frombuffer(walk.run, np.int64)
