@@ -253,7 +253,7 @@ class Plausibility:
         )
 
     def see(self, block: FrameBlock) -> None:
-        """Examine the next block of frames."""
+        """Check the next block of frames for implausible data."""
         entities = block.entities
         before = len(self._idents)
         self._idents += entities.ident

@@ -673,7 +673,7 @@ def _kept(segments: Sequence[Segment], block: FrameBlock) -> FrameBlock:
 
 
 def _ego_of(block: FrameBlock, one: _EgoView) -> Ints:
-    """Return the node id of the ego in each frame, (F,) int64; -1 for a frame without the ego."""
+    """Return the node id of the ego in each frame, (F,); -1 without it. Record if the ego occurred."""
     idents = enumerate(block.entities.ident, start=block.entities.first)
     one.nodes += [node for node, ident in idents if ident == one.info.ego]
     rows = np.isin(block.states.node, one.nodes)

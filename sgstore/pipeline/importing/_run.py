@@ -550,5 +550,5 @@ def _lane_states(inside: Mapping[tuple[int, int, int], dict[str, float]]) -> Lan
 
 
 def _whole(rows: Sequence[tuple[int, ...]], width: int) -> list[Ints]:
-    """Return the values of each column in rows of integers, as int64 arrays."""
+    """Convert rows of integers to columns, as int64 arrays."""
     return list(np.array(rows, np.int64).reshape(-1, width).T.copy())
