@@ -175,7 +175,7 @@ BESIDE_S: Final = 5.0
 
 
 def _beside(connection: DuckDBPyConnection, frame: FrameRef) -> tuple[int, int]:
-    """Return the numbers of the first and last frame within :data:`BESIDE_S` of the given frame."""
+    """Return the first and last number of the frames within :data:`BESIDE_S` seconds of the given frame."""
     sql = "SELECT min(seq), max(seq) FROM frames WHERE trace_id = ? AND abs(t - ?) < ?"
     found = connection.execute(sql, [frame.trace_id, frame.t, BESIDE_S]).fetchone()
     return found or (0, -1)

@@ -228,7 +228,7 @@ class TopicWriter:
         self._files[batch.topic] = replace(file, messages=file.messages + len(batch.number))
 
     def files(self, reading: TopicReading) -> list[TopicFile]:
-        """Return the written topics, with the types of their fields in all files."""
+        """Write the waiting batches. Return all written topics, with the types of their fields."""
         for batch in self._before.values():
             self._write(batch)
         self._before.clear()
