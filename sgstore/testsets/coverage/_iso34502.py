@@ -116,7 +116,7 @@ def _cells_of(chosen: ChosenFrames, road: str, said: dict[str, str]) -> Iterator
 
 
 def _selected(chosen: ChosenFrames, frame_id: Ints) -> Ints:
-    """Return the given frames that are selected."""
+    """Return those of the given frames that belong to the selection."""
     if chosen.frame_id is None:
         return frame_id
     return frame_id[np.isin(frame_id, chosen.frame_id)]

@@ -372,7 +372,7 @@ class Holdings:
         return replace(found, weight=self.weight)
 
     def joined(self, other: Holdings) -> Holdings:
-        """Return the elements of both: a selection then keeps, for example, classes and sequences."""
+        """Return the elements of this object and another one, so that a selection covers both."""
         pairs = np.concatenate(
             [self.pairs, other.pairs + np.array([[0], [len(self.weight)]])], axis=1
         )
