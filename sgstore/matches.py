@@ -1074,7 +1074,7 @@ class UnionMatches(Matches):
         return tuple(dict.fromkeys(note for part in self._parts for note in part.mistakes))
 
     def nearest(self) -> dict[str, Any]:
-        """Return the frame that comes closest to the first single query without matches."""
+        """Return the frame nearest to a match of the first query without matches; otherwise an empty dict."""
         return next(filter(None, (part.nearest() for part in self._parts)), {})
 
     def _rows(self, *, whole: bool) -> Iterator[Row]:
@@ -1107,7 +1107,7 @@ class UnionMatches(Matches):
             yield one
 
     def _joined(self) -> dict[str, Any]:
-        """Return the arguments with which a :class:`StoreFile` selects all rows of the union.
+        """Return the arguments with which a :class:`StoreFile` selects all rows of the ``UNION``.
 
         Each part becomes a temporary table.
         """
