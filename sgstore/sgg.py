@@ -236,7 +236,7 @@ class SceneGraphGenerator:
         yield from self._driven.chosen(blocks)
 
     def block(self, frames: FrameBlock) -> GraphBlock:
-        """Return the scene graphs of the next frames. Each frame defines its ego.
+        """Return the scene graphs of the next block of frames. Each frame defines its ego.
 
         Raises
         ------
