@@ -298,7 +298,7 @@ class StoreTools:
         parameters: Values = None,
         traces: Traces = None,
     ) -> ToolAnswer:
-        """Check properties that must be true in every trace.
+        """Check rules that must be true in every trace.
 
         A violated ALWAYS p lasts to the end of the trace; find NOT p, form intervals, lists the times.
 

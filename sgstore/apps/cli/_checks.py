@@ -60,7 +60,7 @@ def check(
     statements: Statements,
     ask: AskOptions,
 ) -> int:
-    """Check properties that must be true in every trace.
+    """Check rules that must be true in every trace.
 
     One row a check and trace: true, false, unknown where it cannot be told, or pending where something is
     still due at the end; and one a violation: by whom, and from when to when.

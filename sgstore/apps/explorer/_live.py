@@ -161,7 +161,7 @@ class LiveRun:
         return found
 
     def _new_still(self, things: Things) -> list[list[Any]]:
-        """Return the static entities that were not sent yet, each with position, heading and size."""
+        """Return the static entities not sent yet (position, heading, size), and mark them as sent."""
         x, y = self._origin or (0.0, 0.0)
         new = [n for n, about in things.items() if about["is_static"] and n not in self._still]
         for node in new:
