@@ -28,10 +28,13 @@ from oracle_over_time import (
     worlds,
 )
 from oracle_temporal import holds, random_formula, random_word
+from recordings import Recorder
+from recordings import car as recorded
 from thorough import LONG
 
 from sgstore.apps.cli import run as run_verb
 from sgstore.errors import QueryError
+from sgstore.ingest import ingest
 from sgstore.lang.ir import BoundHold, Length
 from sgstore.lang.library import pattern_named
 from sgstore.query import Store
@@ -746,3 +749,25 @@ def test_the_verb_ends_with_4_only_if_something_is_violated(
     assert all(
         row["first_violation"]["start_seq"] == row["violations"][0]["start_seq"] for row in rows
     )
+
+
+@pytest.mark.parametrize(
+    ("premise", "applied"), [("v.speed > 10", 8), ("v.speed > 7 OR w.speed > 7", None)]
+)
+def test_a_premise_refuses_no_check(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, premise: str, applied: int | None
+) -> None:
+    """Another car than the ego is fast in frames 5 to 12."""
+    with Recorder(tmp_path / "drive.mcap") as recorder:
+        for frame in range(20):
+            speeds = (8, 12 if 5 <= frame <= 12 else 8, 8)
+            cars = [recorded(n, 30.0 * n, v=(v, 0)) for n, v in enumerate(speeds, 1)]
+            recorder.ground_truth(frame / 10, cars, host=1)
+    ingest(tmp_path / "drive.sgstore", [tmp_path / "drive.mcap"])
+    monkeypatch.setattr(_offline, "MOST_BINDINGS", 4)
+
+    (verdict,) = Store(tmp_path / "drive.sgstore").check(
+        f"CHECK FORALL (v:Car, w:Car) ALWAYS ({premise} IMPLIES dist(v, w) > 1)"
+    )
+
+    assert (verdict.verdict, verdict.applied_frames, verdict.bindings) == ("true", applied, 6)

@@ -222,21 +222,6 @@ def test_a_true_verdict_tells_how_often_the_check_applied(
     assert bool(verdict.never_applied) == (0 in {applied, bindings})
 
 
-@pytest.mark.parametrize(
-    ("premise", "applied"), [("v.speed > 10", 8), ("v.speed > 7 OR w.speed > 7", None)]
-)
-def test_a_premise_refuses_no_check(
-    applying: Store, monkeypatch: pytest.MonkeyPatch, premise: str, applied: int | None
-) -> None:
-    monkeypatch.setattr("sgstore.temporal._offline.MOST_BINDINGS", 4)
-
-    (verdict,) = applying.check(
-        f"CHECK FORALL (v:Car, w:Car) ALWAYS ({premise} IMPLIES dist(v, w) > 1)"
-    )
-
-    assert (verdict.verdict, verdict.applied_frames, verdict.bindings) == ("true", applied, 6)
-
-
 def test_a_false_verdict_has_no_count(applying: Store) -> None:
     (verdict,) = applying.check("CHECK ALWAYS (ego.speed > 10 IMPLIES ego.speed > 15)")
 
