@@ -217,7 +217,7 @@ def test_command_without_limit_names_another_way(
 
 
 def test_option_of_other_commands_names_them(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["show", "x", "y", "--graph", "--abstraction", "roadscene2vec"]) == 2
+    assert run(["find", "x", "MATCH (e:Ego)", "--abstraction", "roadscene2vec"]) == 2
     written = " ".join(capsys.readouterr().err.split())
     head, _, names = written.partition("No such option: --abstraction; it is an option of: ")
     assert head

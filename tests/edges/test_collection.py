@@ -76,6 +76,7 @@ QUESTIONS = [
     "MATCH (a:Car)-[:near]->(b) RETURN a.x, frame.seq, trace.name SAMPLE 3 PER b.kind LIMIT 2",
     "MATCH (a:Car)-[:near]->(b) RETURN INTERVALS, b.kind SAMPLE 2 PER b.kind LIMIT 3",
     "MATCH (a:Car) RETURN a ORDER BY a.speed DESC SAMPLE 2 PER a.kind LIMIT 3",
+    "MATCH (a:Car)-[:isIn]->(l:Lane), (b)-[:isIn]->(m:Lane) WHERE l.chain = m.chain RETURN COUNT(*) AS n",
     "MATCH (a:Car)-[:near]->(b) THEN MATCH (a)-[:visible]->(b) RETURN a, b",
     "MATCH (a:Car)-[:near]->(b) FOR >= 0.2s RETURN INTERVALS, a",
     "MATCH (a:Car)-[:near]->(b) AS s THEN MATCH (a)-[:visible]->(b) AS t RETURN a, MIN(a.x) OVER match AS x,"
@@ -512,7 +513,7 @@ VALUES = {
 UNITS = {
     *("plain", "degrees", "east", "north", "up", "light", "derived", "along", "given", "velocity"),
     *("standing", "binding", "owner", "whole", "label", "seconds", "classed", "weather", "clock"),
-    *("span", "role", "recording", "own", "counted", "seen", "inside"),
+    *("span", "role", "recording", "own", "counted", "seen", "inside", "chain"),
 }
 """Units: ``counted`` and ``seen`` speak of all traces, and are given to each bundle
 (lang/sql/collection_parts.py)."""

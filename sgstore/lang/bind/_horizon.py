@@ -256,15 +256,12 @@ class _Looking:
         return found
 
     def _is_joined(self, scope: Scope, key: str) -> bool:
-        """True if a node of a pattern is connected by edges to a node at a limited distance from the ego."""
+        """True if edges, or lanes of one chain, connect a node to a node at a limited distance from the ego."""
+        links = [(edge.src, edge.dst) for edge in scope.edges]
+        links += b.same_chain(scope.where)
         reached, grown = {key}, True
         while grown:
-            fresh = {
-                end
-                for edge in scope.edges
-                if {edge.src, edge.dst} & reached
-                for end in (edge.src, edge.dst)
-            } - reached
+            fresh = {end for link in links if reached.intersection(link) for end in link} - reached
             reached |= fresh
             grown = bool(fresh)
         return any(
