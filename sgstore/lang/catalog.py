@@ -1055,7 +1055,7 @@ class Catalog:
     online: bool = False
 
     def under(self, abstraction: str) -> Catalog | None:
-        """Return the catalog of an abstraction, in any spelling of its name; None if it does not exist."""
+        """Return the catalog (names that a query can use) of an abstraction; None if it does not exist."""
         wanted = normalize_name(abstraction)
         found = [made for name, made in self.sets.items() if normalize_name(name) == wanted]
         if not found and self.part:

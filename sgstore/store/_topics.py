@@ -129,7 +129,7 @@ class FrameClock:
 
     @classmethod
     def of_trace(cls, trace_id: int, time_ns: Ints, log_time_ns: Ints) -> Self:
-        """Return the clock of a new trace, from the times of its frames."""
+        """Return the clock (log time → frame and simulation time) of a trace that is not stored yet."""
         return cls(frame_ids(trace_id, np.arange(len(time_ns))), time_ns, log_time_ns)
 
     @classmethod

@@ -261,7 +261,7 @@ class CheckPlan(Plan):
                 return f.LOGIC[word](*(self.read(one, reading) for one in operands))
 
     def _by_levels(self, found: f.Formula, things: frozenset[str], reading: Reading) -> f.Formula:
-        """Return a formula extended by rules for absent entities: one rule for each quantifier.
+        """Extend a formula: each quantifier decides if it is true while one of its entities is absent.
 
         The outermost quantifier has priority.
         """

@@ -384,7 +384,7 @@ class Monitor:
     def _ask(
         self, graphs: Sequence[SceneGraph], *, classed: bool = False
     ) -> tuple[FrameTime, list[NodeNames]]:
-        """Run all single-frame queries on the graphs of a frame. Return its time, and each ego's nodes."""
+        """Run all single-frame queries on the graphs of a frame. Return its time and each graph's nodes."""
         self._pulse.step(graphs[0].time_ns)
         tick, time = self._pulse.tick, self._pulse.told(self._pulse.tick.time)
         here = FrameTime(tick.number, time, seconds_of(time - self._pulse.start))

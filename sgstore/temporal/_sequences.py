@@ -319,7 +319,7 @@ class Finder:
         self._runs = None if query.spans else RunFinder(*about)
 
     def __call__(self, places: tuple[Bound, ...], window: Window | None) -> ExternalRelation:
-        """Return the matches of the query in all traces that a window touches.
+        """Return the matches of the query in every trace that has a part in a range of frames.
 
         Parameters
         ----------

@@ -244,7 +244,7 @@ class Settled:
 
     @cached_property
     def _missed(self) -> Places:
-        """For each frame, return the frame at which its formula is decided as false, for the complete trace."""
+        """For each frame, return where the formula that starts there becomes false. The trace has ended."""
         return known(self.formula, self._table, ended=self._tolerance)[1]
 
     def due(self, start: int, end: str) -> bool:

@@ -125,7 +125,7 @@ def scenes(a: Classed, b: Classed) -> ReportTable:
 
 
 def by_frame(a: Classed, b: Classed) -> ReportTable:
-    """Return a table that counts the frames with equal and with different scene classes, by trace name.
+    """For each trace in two selections, count the frames that have the same or another scene class.
 
     Returns
     -------

@@ -409,7 +409,7 @@ class _Crossings:
         return _summed(cost, -self._step, self._dst, self._src, self._toll)
 
     def least(self, cost: Floats) -> Floats:
-        """Return the least cost in the frame of each candidate lane."""
+        """For each candidate lane, return the cost of the cheapest candidate in the same frame."""
         return np.minimum.reduceat(cost, self._first)[self._frame] if len(cost) else cost
 
     def more(self, cost: Floats) -> Floats:

@@ -400,7 +400,7 @@ def _bare(nodes: Mapping[str, b.Node], edges: Iterable[b.Edge]) -> b.Scope:
 
 
 def _in_blocks(values: Iterable[b.Bound]) -> Iterable[b.Bound]:
-    """Yield all subexpressions inside the patterns in braces, such as ``EXISTS {…}``, of expressions."""
+    """Yield all expressions that are inside braces, such as in ``EXISTS {…}``, in the given expressions."""
     for value in values:
         for block in b.blocks_of(value):
             for inner in block.inside:

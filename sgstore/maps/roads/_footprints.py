@@ -117,7 +117,7 @@ def _quads(ribbons: Ribbons) -> _Quads:
 
 
 def _unfold(x: Floats, y: Floats) -> None:
-    """Correct twisted pieces of lane surfaces in the given arrays: if two ends cross, cut both there.
+    """Repair lane pieces that fold over in tight bends: end them where their ends cross. Changes x and y.
 
     In a bend that is tighter than the lane is wide, the inner border runs backwards, beyond the
     centre of the bend. This part adds no area to the lane.

@@ -92,7 +92,7 @@ def _force(family: SetFamily, need: Ints, alive: Bools, forced: Bools) -> None:
 
 
 def _drop_same_elements(family: SetFamily, need: Ints, alive: Bools, wanted: Bools) -> None:
-    """If several elements are in exactly the same sets, keep only the one that needs the most sets."""
+    """If exactly the same sets contain several elements, keep the one that must be covered most often."""
     rows = alive[family.set_of] & wanted[family.members]
     key = _keys(family.members[rows], family.set_of[rows], len(need), len(family))
     elements = np.flatnonzero(wanted)

@@ -138,7 +138,7 @@ class PrioritySpec:
             )
 
     def as_dict(self, query: str) -> dict[str, Any]:
-        """Return the specification of the order as plain values, which a lock file stores."""
+        """Return the settings of a test case order as plain values, which a lock file stores."""
         clip = self.unit is SelectionUnit.clip
         return {
             "query": query or None,
