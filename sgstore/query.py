@@ -1456,6 +1456,8 @@ class Store(StoreVerbs):
         self,
         frame: int | str | FrameRef,
         query: str | Pattern | nx.Graph[Any] | None = None,
+        *,
+        abstraction: str = "",
         **look: Any,
     ) -> Image:
         """Draw a frame as a bird's-eye view, next to the camera picture.
@@ -1466,6 +1468,8 @@ class Store(StoreVerbs):
             Frame, as for :meth:`graph`.
         query : str, Pattern or networkx graph, optional
             Query, as for :meth:`find`; its matches in the frame are marked.
+        abstraction : NAME
+            Draw the graph of this abstraction instead: E, EL, ER, RSV, …; its nodes and edges.
         **look
             ``camera``, ``relations``, ``radius``, ``north_up``, ``diagram``, ``names``: see
             :func:`sgstore.draw.draw_stored`.
@@ -1478,7 +1482,8 @@ class Store(StoreVerbs):
         Raises
         ------
         StoreError, QueryError, ExportError, TraceError
-            The frame or channel does not exist, the query is invalid, or the recording is missing.
+            The frame or channel does not exist, the query is invalid, the recording is missing, or an
+            abstraction is given with a query or a look.
         MissingExtraError
             The packages for drawing are not installed.
 
@@ -1486,11 +1491,17 @@ class Store(StoreVerbs):
         --------
         >>> near = "MATCH (e:Ego)-[:near_coll]->(v:Vehicle)"
         >>> store.show("town#264", near, camera="none").save("frame.png")
+        >>> store.show("town#264", abstraction="RSV").save("graph.png")
         """
         from sgstore.draw import frame_image
+        from sgstore.errors import ExportError
 
+        if abstraction and (query is not None or look):
+            raise ExportError(
+                "abstraction= draws the whole graph of one frame; it takes no query or look"
+            )
         matches = None if query is None else self.find(query)
-        return frame_image(self, _ref(frame), matches, **look)
+        return frame_image(self, _ref(frame), matches, abstraction=abstraction, **look)
 
     def traces(self) -> tuple[StoredTrace, ...]:
         """Return the traces of the store by name, in natural order (``run2`` before ``run10``).

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 
+from sgstore.base.display import number_of
 from sgstore.draw._animation import animation
 from sgstore.draw._film import FilmPage
 from sgstore.draw._legend import entries_of
@@ -21,6 +22,7 @@ from sgstore.draw._picture import (
     checked,
     diagram_page,
     draw_frame,
+    draw_graph,
     frame_page,
     matched_nodes,
     title_of,
@@ -174,6 +176,7 @@ def draw_stored(  # noqa: PLR0913  as many options as the picture has
     north_up: bool = False,
     diagram: bool = False,
     names: Names = "number",
+    abstraction: str = "",
 ) -> bool:
     """Draw a picture of a stored frame seen from above; return True if the query matches in the frame.
 
@@ -193,6 +196,8 @@ def draw_stored(  # noqa: PLR0913  as many options as the picture has
     names : str
         Labels of entities: ``number`` (``car 17``), ``ident`` (the simulator's id), ``type`` (its
         type).
+    abstraction : str
+        Draw the graph of this abstraction instead; all other options are ignored.
 
     Returns
     -------
@@ -205,6 +210,9 @@ def draw_stored(  # noqa: PLR0913  as many options as the picture has
         The frame or channel is missing; the picture cannot be made; the recording is missing or was
         replaced.
     """
+    if abstraction:
+        _draw_abstraction(store, frame, to, abstraction)
+        return False
     with store.file.snapshot():
         ref = store.file.frame(frame)
         bindings = matches.bindings(ref) if matches is not None else []
@@ -222,6 +230,15 @@ def draw_stored(  # noqa: PLR0913  as many options as the picture has
             diagram=diagram,
         )
     return bool(bindings)
+
+
+def _draw_abstraction(store: Store, frame: int | str, to: str | Path, abstraction: str) -> None:
+    """Draw the graph of a frame in an abstraction."""
+    graph = store.graph(frame, abstraction)
+    ref = store.file.frame(frame)
+    size = f"{number_of(len(graph), 'node')}, {number_of(graph.number_of_edges(), 'edge')}"
+    title = f"{ref.trace}   frame {ref.seq}   {ref.t:.3f} s"
+    draw_graph(graph, to, title=title, subtitle=f"graph of the abstraction {abstraction}: {size}")
 
 
 def draw_clip(  # noqa: PLR0913  as many options as the picture has

@@ -6,10 +6,13 @@ import xml.etree.ElementTree as ET
 from typing import TYPE_CHECKING
 
 import networkx as nx
+import numpy as np
 import pytest
+from PIL import Image
 
 from sgstore.apps.cli import run
 from sgstore.draw import draw_graph
+from sgstore.errors import ExportError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -62,3 +65,14 @@ def test_other_looks_are_refused(
 
     assert run(line) == 2
     assert "--abstraction draws the whole graph of one frame" in capsys.readouterr().err
+
+
+def test_a_store_shows_an_abstraction_without_a_query(open_town: Store, tmp_path: Path) -> None:
+    open_town.show("town#264", abstraction="RSV").save(tmp_path / "a.png")
+    line = ["show", str(open_town.file.path), "town#264", "--abstraction", "RSV"]
+    assert run([*line, "-o", str(tmp_path / "b.png")]) == 0
+
+    assert (tmp_path / "a.png").stat().st_size > 1000
+    assert np.array_equal(*(np.array(Image.open(tmp_path / f"{one}.png")) for one in "ab"))
+    with pytest.raises(ExportError, match="no query or look"):
+        open_town.show("town#264", "MATCH (e:Ego)", abstraction="RSV")

@@ -255,17 +255,6 @@ class DrawOptions:
         return {"matches": matches, **options}
 
 
-def _draw_abstraction(store: Store, frame: str, abstraction: str, to: Path) -> None:
-    """Draw the graph of a frame in an abstraction."""
-    from sgstore.draw import draw_graph
-
-    graph = store.graph(frame, abstraction)
-    ref = store.file.frame(frame)
-    size = f"{number_of(len(graph), 'node')}, {number_of(graph.number_of_edges(), 'edge')}"
-    title = f"{ref.trace}   frame {ref.seq}   {ref.t:.3f} s"
-    draw_graph(graph, to, title=title, subtitle=f"graph of the abstraction {abstraction}: {size}")
-
-
 @verbs.command(rich_help_panel=PANEL)
 def show(
     store: StorePath,
@@ -300,7 +289,7 @@ def show(
             raise typer.BadParameter(
                 "--abstraction draws the whole graph of one frame; it takes no clip, query or look"
             )
-        _draw_abstraction(opened, frame, abstraction, to)
+        draw_stored(opened, frame, to, abstraction=abstraction)
         typer.echo(to)
         return 0
     options = drawn.options(opened.find(text, **values) if text else None)
