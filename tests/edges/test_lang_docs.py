@@ -29,10 +29,18 @@ def words() -> set[str]:
     return set(re.findall(r"[A-Za-z_][\w]*", PATH.read_text(encoding="utf-8")))
 
 
-@pytest.mark.parametrize("text", QUERIES)
-def test_a_query_of_the_page_compiles_and_runs(text: str) -> None:
+def database() -> duckdb.DuckDBPyConnection:
+    """A database with the views of a store without traces, and the table of chains that a store adds."""
     connection = duckdb.connect()
     connection.execute(SCHEMA)
+    columns = "map_id BIGINT, src INTEGER, dst INTEGER"
+    connection.execute(f'CREATE TEMP TABLE "{catalog.LANE_CHAINS}" ({columns})')
+    return connection
+
+
+@pytest.mark.parametrize("text", QUERIES)
+def test_a_query_of_the_page_compiles_and_runs(text: str) -> None:
+    connection = database()
 
     statement = compile_query(text, CATALOG).rows()
 
@@ -99,8 +107,7 @@ def test_a_predicate_of_the_library_can_be_asked(name: str) -> None:
         or "(:Ego)"
     )
     arguments = [values.get(argument, argument) for argument in arguments]
-    connection = duckdb.connect()
-    connection.execute(SCHEMA)
+    connection = database()
 
     compiled = compile_query(
         f"MATCH {nodes} WHERE {definition.name}({', '.join(arguments)})", CATALOG
