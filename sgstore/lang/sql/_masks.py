@@ -224,7 +224,7 @@ class SqlBuilder:
         return '"known_edge"' if self.catalog.world and edge.known else '"edge"'
 
     def nodes_of(self, edge: Edge) -> str:
-        """Return the name of the table that tells in which frames the two nodes of an edge are present."""
+        """Return the name of the table with the frames in which the two nodes of an edge are present."""
         return '"graph_node"' if self.catalog.world and not edge.known else '"node"'
 
     def found_in(self, scope: Scope) -> SharedRelation | None:
