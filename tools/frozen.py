@@ -25,6 +25,7 @@ import re
 import shlex
 import sys
 import tempfile
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,11 +36,13 @@ from sgstore.apps.cli import run as command_line
 from sgstore.apps.demo import RECORDING
 from sgstore.ingest import ingest
 from sgstore.lang.library import patterns
+from sgstore.matches import Interval
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from sgstore.query import Store
+    from sgstore.temporal import Verdict
 
 FROZEN = Path(__file__).parents[1] / "tests" / "frozen"
 DATA = Path(os.environ.get("SGSTORE_DATA") or Path(__file__).parents[2] / "shared/data").resolve()
@@ -139,6 +142,12 @@ def views_of(store: Store) -> dict[str, list[str]]:
     return found
 
 
+def extents(verdict: Verdict) -> str:
+    """Frames of the violations as text, without the runs in which their condition is false."""
+    names = [one.name for one in fields(Interval)]
+    return str(tuple(Interval(*(getattr(v, n) for n in names)) for v in verdict.violations))
+
+
 def answers(store: Store) -> Iterator[tuple[str, Any]]:
     """Verdicts of every rule of the library, and how often each of its patterns matches."""
     for name, one in patterns().items():
@@ -147,7 +156,7 @@ def answers(store: Store) -> Iterator[tuple[str, Any]]:
         if one.is_check:
             yield (
                 name,
-                [(v.verdict, v.violations and str(v.violations)) for v in store.check(one.text)],
+                [(v.verdict, v.violations and extents(v)) for v in store.check(one.text)],
             )
         else:
             matches = store.find(one.text)

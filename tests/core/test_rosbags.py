@@ -259,7 +259,7 @@ def located(path: Path) -> Path:
             stack.pose(t, 8 * t, 0.0, v=(8.0, 0.0, 0.0))
             stack.objects(t, [autoware_recordings.thing("car", 8 * t + 20, 0)])
             told = {
-                "timestamp": {"sec": 1, "nanosec": i},
+                "timestamp": {"sec": 10**9, "nanosec": i},  # of another clock
                 "frame_id": "gps",
                 "latitude": 48 + i / 8,
                 "position_covariance": [i / 3] * 9,

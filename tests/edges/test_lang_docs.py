@@ -8,7 +8,7 @@ from pathlib import Path
 
 import duckdb
 import pytest
-from oracle_worlds import SCHEMA
+from oracle_worlds import SCHEMA, add_chains
 from test_lang_golden import CATALOG
 
 from sgstore.errors import QueryError
@@ -33,8 +33,7 @@ def database() -> duckdb.DuckDBPyConnection:
     """A database with the views of a store without traces, and the table of chains that a store adds."""
     connection = duckdb.connect()
     connection.execute(SCHEMA)
-    columns = "map_id BIGINT, src INTEGER, dst INTEGER"
-    connection.execute(f'CREATE TEMP TABLE "{catalog.LANE_CHAINS}" ({columns})')
+    add_chains(connection)
     return connection
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import duckdb
 import networkx as nx
 
-from sgstore.lang.catalog import Catalog, TraceFacts
+from sgstore.lang.catalog import LANE_CHAINS, Catalog, TraceFacts
 from sgstore.model.vocabulary import MAP_KINDS
 from sgstore.store._locking import without_faults
 from sgstore.store._schema import schema_sql
@@ -287,8 +287,15 @@ def random_world(
     without_faults(connection)
     if path is None:
         connection.execute(SCHEMA)
+        add_chains(connection)
     store_all(connection, made, rng)
     return World(made, connection)
+
+
+def add_chains(connection: duckdb.DuckDBPyConnection) -> None:
+    """Add the table of pairs of lanes that are one lane, as a store does; here, each lane is alone."""
+    columns = "map_id BIGINT, src INTEGER, dst INTEGER"
+    connection.execute(f'CREATE TEMP TABLE "{LANE_CHAINS}" ({columns})')
 
 
 def random_trace(
