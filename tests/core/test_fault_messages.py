@@ -173,4 +173,4 @@ def test_no_duration_is_negative(tmp_path: Path, capsys: pytest.CaptureFixture[s
         run([str(word) for word in line])
         out = capsys.readouterr().out
         assert re.findall(r" -[\d.]+ +s(?! before)", out) == []
-        assert re.search(r"\b2( s, mostly every 0.1 s| +1|, *$| s\n)", out), out
+        assert re.search(r"\b2( s, 10 Hz| s, mostly every 0.1 s| +1|, *$| s\n)", out), out

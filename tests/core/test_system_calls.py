@@ -212,7 +212,7 @@ def test_a_folder_in_use_stays_if_its_lock_failed_for_a_moment(
     injected = fail(fcntl, "flock", code)
     held = HeldFolder(tmp_path, "held-")
     monkeypatch.setattr(fcntl, "flock", flock)
-    assert injected.hits == 1
+    assert injected.hits  # a folder that is collected meanwhile takes a lock, too
     (held.path / "content").write_text("x")
 
     sweep(tmp_path, "held-")  # by another process, which gets its lock
