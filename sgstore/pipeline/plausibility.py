@@ -13,6 +13,7 @@ numbers counts only if most rows agree on one factor, angle or axis. Noise does 
 from __future__ import annotations
 
 import re
+from array import array
 from collections import Counter
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -232,8 +233,7 @@ class Plausibility:
         self._client_nodes: dict[str, int] = {}
         self._kinds: Ints = np.zeros(0, np.int64)
         self._rows: BodyRows | None = None
-        self._times: Ints = np.zeros(0, np.int64)
-        self._log_times: Ints = np.zeros(0, np.int64)
+        self._time_ns, self._log_time_ns = array("q"), array("q")
         self._tally = Tally()
         self._events: dict[str, _Event] = {}
         self._moves: list[_Move] = []
@@ -260,8 +260,8 @@ class Plausibility:
         lights = np.flatnonzero(entities.kind == KIND_CODE["traffic_light"]).tolist()
         self._lights |= {before + row: entities.map_ref[row] for row in lights}
         self._kinds = np.concatenate([self._kinds, entities.kind.astype(np.int64)])
-        self._times = np.concatenate([self._times, block.time_ns])
-        self._log_times = np.concatenate([self._log_times, block.log_time_ns])
+        self._time_ns.frombytes(block.time_ns.astype(np.int64).tobytes())
+        self._log_time_ns.frombytes(block.log_time_ns.astype(np.int64).tobytes())
         missing = np.flatnonzero(block.ego < 0)
         present = np.flatnonzero(block.ego >= 0)
         if len(present):
@@ -322,7 +322,7 @@ class Plausibility:
         columns = dict(zip(names, numbers.T, strict=True))
         columns |= {name: columns[name].astype(np.int64) for name in names[-3:]}
         counts = [sum(not e.static for e in frame.entities) for frame in frames]
-        first = len(self._times)
+        first = len(self._time_ns)
         none = np.zeros(0, np.int64)
         self.see(
             FrameBlock(
@@ -364,7 +364,7 @@ class Plausibility:
         if self._lit:
             self._judge_lights()
         self._judge()
-        steps = np.diff(self._times)
+        steps = np.diff(self._time_ns)
         for kind, words, wrong in (
             ("doubled stamps", "stands still", steps == 0),
             ("unsorted stamps", "runs backwards", steps < 0),
@@ -382,7 +382,8 @@ class Plausibility:
                 self._finding(kind, event.node, event.frame, event.nodes, event.times, event.value)
             )
         if passes is not None:
-            within = (self._log_times >= passes.start_ns) & (self._log_times <= passes.end_ns)
+            logged = np.array(self._log_time_ns)
+            within = (logged >= passes.start_ns) & (logged <= passes.end_ns)
             mixed = {row + later for row in np.flatnonzero(within).tolist() for later in (0, 1)}
             found = [one for one in found if one.kind not in _OF_STEPS or one.frame not in mixed]
             first, times = min(mixed, default=0), int(within.sum())
@@ -399,7 +400,7 @@ class Plausibility:
         return Finding(kind, ident, frame, seconds, entities, times, value, REMEDY[kind])
 
     def _seconds(self, frame: int) -> float:
-        times = self._times
+        times = self._time_ns
         return int(times[min(frame, len(times) - 1)] - times[0]) / 1e9
 
     def _happen(self, kind: str, node: int, frame: int, value: str) -> None:
@@ -516,7 +517,7 @@ class Plausibility:
     def _judge_moves(self) -> None:
         """Count jumps as faults: ``swapped ids`` if two objects exchange places, else ``teleport``."""
         frames: dict[int, list[_Move]] = {}
-        step = _USUAL * float(np.median(np.diff(self._times))) / 1e9 if self._moves else 0.0
+        step = _USUAL * float(np.median(np.diff(self._time_ns))) / 1e9 if self._moves else 0.0
         for move in self._moves:
             frames.setdefault(move.frame, []).append(move)
         for frame, moves in frames.items():
@@ -742,7 +743,7 @@ class Plausibility:
         flickers = self._events.get("light flickers")
         if flickers is not None and flickers.times < 2:
             del self._events["light flickers"]
-        span = int(self._times[-1] - self._times[0]) if len(self._times) else 0
+        span = self._time_ns[-1] - self._time_ns[0] if self._time_ns else 0
         if self._lit and not self._changed and span > CYCLE_NS:
             value = f"no light changes in {span / 1e9:g} s"
             self._happen("lights never change", min(self._lit), 0, value)
