@@ -446,7 +446,7 @@ NODE_ATTRIBUTES: Final = _named(
         _of_map(
             "chain",
             Type.number,
-            "of a lane: the same number in all parts of the map that are one lane, outside of junctions",
+            "of a lane: the same number in all parts of the map that are one lane",
             _LANES,
             DisplayUnit.chain,
         ),

@@ -143,5 +143,6 @@ def test_the_number_of_a_chain_is_the_same_in_both_evaluators(store: Store) -> N
     frames = np.array(sorted({frame for frame, _ in told}))
     views = {int(graph.frame_id): FrameView(graph) for graph in store.file.graphs(frames)}
 
+    assert {type(chain) for chain in told.values()} == {int}
     assert any(lane != chain for (_, lane), chain in told.items())
     assert told == {at: views[at[0]].chain_of(at[1]) for at in told}

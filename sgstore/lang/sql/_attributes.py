@@ -215,7 +215,12 @@ _STILL: Final = {
 }
 """SQL values of the motion attributes for entities and map parts that never move."""
 
-_CONVERTED: Final = {DisplayUnit.degrees: "degrees({1})", DisplayUnit.whole: "CAST({0} AS BIGINT)"}
+_INTEGER: Final = "CAST({0} AS BIGINT)"
+_CONVERTED: Final = {
+    DisplayUnit.degrees: "degrees({1})",
+    DisplayUnit.whole: _INTEGER,
+    DisplayUnit.chain: _INTEGER,
+}
 
 
 def _label(at: Aliases) -> str:
