@@ -1098,6 +1098,14 @@ def blocks_of(expression: Bound) -> tuple[BlockValue, ...]:
     return tuple(part for part in walk(expression) if isinstance(part, BlockValue))
 
 
+def all_blocks(expressions: Iterable[Bound]) -> Iterator[BlockValue]:
+    """Yield all patterns in braces in some expressions, also those inside others."""
+    for expression in expressions:
+        for block in blocks_of(expression):
+            yield block
+            yield from all_blocks(block.inside)
+
+
 @dataclass(frozen=True, slots=True)
 class Length:
     """Duration in a query: a number of nanoseconds or of frames."""

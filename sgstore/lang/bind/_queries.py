@@ -27,7 +27,7 @@ from sgstore.lang.syntax import tree as s
 from sgstore.model.vocabulary import entity_kinds, normalize_name
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from sgstore.lang.catalog import Catalog
 
@@ -137,7 +137,7 @@ def _absent_egos(query: b.Query, catalog: Catalog) -> list[str]:
         return []  # traces without an ego are left out, with this reason
     values = [value for scope in query.patterns for value in scope.where]
     values += [value for step in query.steps for value in step.when]
-    inside = (block.scope for block in _blocks([*values, *query.result.values]))
+    inside = (block.scope for block in b.all_blocks([*values, *query.result.values]))
     if not any(_is_ego(node) for scope in inside for node in scope.nodes.values()):
         return []
     traces = [one for one in catalog.traces if catalog.only is None or one.trace_id in catalog.only]
@@ -150,14 +150,6 @@ def _absent_egos(query: b.Query, catalog: Catalog) -> list[str]:
 
 def _is_ego(node: b.Node) -> bool:
     return bool(node.kinds.ego) and not node.kinds.other
-
-
-def _blocks(values: Iterable[b.Bound]) -> Iterator[b.BlockValue]:
-    """Yield all patterns in braces, also those inside others."""
-    for part in (part for value in values for part in b.walk(value)):
-        if isinstance(part, b.BlockValue):
-            yield part
-            yield from _blocks(part.inside)
 
 
 def _is_entity(query: b.Query, node: str) -> bool:

@@ -401,8 +401,6 @@ def _bare(nodes: Mapping[str, b.Node], edges: Iterable[b.Edge]) -> b.Scope:
 
 def _in_blocks(values: Iterable[b.Bound]) -> Iterable[b.Bound]:
     """Yield all expressions that are inside braces, such as in ``EXISTS {…}``, in the given expressions."""
-    for value in values:
-        for block in b.blocks_of(value):
-            for inner in block.inside:
-                yield from b.walk(inner)
-            yield from _in_blocks(block.inside)
+    for block in b.all_blocks(values):
+        for inner in block.inside:
+            yield from b.walk(inner)

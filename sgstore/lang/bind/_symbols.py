@@ -14,13 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from sgstore.errors import QueryError, QueryNameError
 from sgstore.lang.bind._in_range import scopes_of
-from sgstore.lang.catalog import (
-    PAIR_NAMES,
-    RECORDED_OWN,
-    TOLERANCE_NS,
-    Type,
-    topic_attribute,
-)
+from sgstore.lang.catalog import PAIR_NAMES, RECORDED_OWN, TOLERANCE_NS, Type, topic_attribute
 from sgstore.lang.ir import (
     Bound,
     Edge,

@@ -234,7 +234,7 @@ class SqlBuilder:
     def within(self, column: str, per: int = 1, *, met: bool = False) -> list[str]:
         """Return SQL conditions that keep only frames (or buckets of 60 frames) in the time window.
 
-        It holds buckets of 60 frames, or frames if ``per`` is 64.
+        ``per``: 64 if the column has ids of frames, 1 if it has buckets.
 
         ``met``: the rows are joined with rows of the selected traces. Then the range is sufficient, unless
         matches are known.
