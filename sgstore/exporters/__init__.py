@@ -16,7 +16,6 @@ from sgstore.exporters._sensor_data import cloud_of
 from sgstore.exporters._transforms import Mount, parse_mounts
 from sgstore.exporters._write import (
     around_frames,
-    around_matches,
     labelled,
     whole_clips,
     write_export,
@@ -37,7 +36,6 @@ __all__ = [
     "WrittenClip",
     "WrittenFile",
     "around_frames",
-    "around_matches",
     "check_folder",
     "cloud_of",
     "exporter_named",

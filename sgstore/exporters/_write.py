@@ -19,17 +19,14 @@ from sgstore.exporters._clips import (
 )
 from sgstore.exporters._labels import Labels
 from sgstore.exporters._registry import EXPORTERS, exporter_named
-from sgstore.lang.ir import CLIP_COLUMNS
 from sgstore.matches import merged
-from sgstore.model.frame_ids import frame_ids
 from sgstore.model.vocabulary import natural
-from sgstore.model.world import Clip, longest_step_ns, tolerance_ns
+from sgstore.model.world import Clip, tolerance_ns
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from sgstore.exporters._registry import Exporter
-    from sgstore.matches import Matches
     from sgstore.query import Store
 
 _SEVERAL: Final = {"mounts": "mount", "channels": "channel"}
@@ -63,54 +60,6 @@ def around_frames(
     return list(
         merged(sorted(clips, key=lambda clip: (natural(clip.trace), clip.start_ns)), periods)
     )
-
-
-def around_matches(
-    store: Store, matches: Matches, before: float, after: float
-) -> tuple[list[Clip], int]:
-    """Return clips around matches, as :meth:`Matches.clips`, and the number of matches.
-
-    Both are from one search. Only a query that limits or sorts its matches is searched twice.
-
-    Parameters
-    ----------
-    store : Store
-    matches : Matches
-    before, after : float
-        Time added at both ends; s. The offsets of ``RETURN CLIPS(-3s, +5s)`` override them.
-    """
-    if matches.lists != "matches":
-        return list(matches.clips(before, after)), sum(1 for _ in matches.intervals())
-    traces = {one.name: one for one in store.info()}
-    if matches.columns[: len(CLIP_COLUMNS)] == CLIP_COLUMNS:
-        found = [Clip(*row[: len(CLIP_COLUMNS)]) for row in matches]
-        number = len(found)
-    else:
-        runs: list[tuple[int, int, int, int]] = []  # trace, first and last frame, time of the last
-        number = 0
-        for one in sorted(matches.intervals(), key=lambda one: (one.trace, one.start_seq)):
-            number += 1
-            trace = traces[one.trace]
-            first, last, end_ns = one.start_seq, one.end_seq, one.end_ns
-            if runs and runs[-1][0] == trace.trace_id:
-                step = one.start_ns - runs[-1][3]
-                follows = first == runs[-1][2] + 1 and 0 <= step <= longest_step_ns(trace.period_ns)
-                if first <= runs[-1][2] or follows:
-                    _, first, *ends = runs.pop()
-                    last, end_ns = max(ends, [last, end_ns])
-            runs.append((trace.trace_id, first, last, end_ns))
-        ids, firsts, lasts, _ = np.array(runs, np.int64).reshape(-1, 4).T
-        rows = store.file.rows(
-            "SELECT any_value(trace), min(log_time_ns), max(log_time_ns) FROM frames JOIN"
-            " (SELECT unnest($first::BIGINT[]) AS a, unnest($last::BIGINT[]) AS b)"
-            " ON frame_id BETWEEN a AND b GROUP BY a",
-            {"first": frame_ids(ids, firsts).tolist(), "last": frame_ids(ids, lasts).tolist()},
-        )
-        start, end = round(before * 1e9), round(after * 1e9)
-        found = [Clip(name, low - start, high + end) for name, low, high in rows]
-    found.sort(key=lambda clip: (natural(clip.trace), clip.start_ns))
-    slack = {name: tolerance_ns(one.period_ns) for name, one in traces.items()}
-    return list(merged(found, slack)), number
 
 
 def whole_clips(store: Store) -> list[Clip]:

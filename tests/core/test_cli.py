@@ -11,14 +11,12 @@ from contextlib import suppress
 from io import StringIO
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import pytest
 import typer
 from recordings import drive
 
 from sgstore.apps.cli import app, run
-from sgstore.exporters import around_matches
 from sgstore.query import Store
 
 pytestmark = pytest.mark.seconds(19)
@@ -699,24 +697,6 @@ def test_prioritize_and_coverage_say_what_settings_cut(store: str, sgstore: Any)
         code, _, err = sgstore(*words)
         assert code == 0, err
         assert [line for line in err.splitlines() if "lie beyond" in line] == [f"sgstore: {cut}"]
-
-
-@pytest.mark.parametrize("returned", ["", " RETURN v", " RETURN CLIPS(-1s, +2s)", " LIMIT 5"])
-@pytest.mark.parametrize("margins", [(0.0, 0.0), (4.0, 1.0)])
-def test_export_searches_once_for_the_clips_and_the_number_of_matches(
-    store: str, monkeypatch: pytest.MonkeyPatch, returned: str, margins: tuple[float, float]
-) -> None:
-    opened = Store(store)
-    for pattern in ("(e:Ego)-[:near_coll]->(v:Truck|Van)", "(e:Ego)-[:near]->(v:Vehicle)"):
-        matches = opened.find(f"MATCH {pattern}{returned}")
-        clips, number = list(matches.clips(*margins)), sum(1 for _ in matches.intervals())
-        with monkeypatch.context() as patched:
-            counted = mock.Mock(side_effect=matches._answered)
-            patched.setattr(matches, "_answered", counted)
-            found = around_matches(opened, matches, *margins)
-        assert found == (clips, number)
-        assert clips
-        assert counted.call_count == 1 or "LIMIT" in returned
 
 
 def test_export_notes_that_a_clip_begins_with_context(

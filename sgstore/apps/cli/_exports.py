@@ -112,11 +112,14 @@ def export(
     return LOSS if any(one.losses for one in written) else 0
 
 
-def _say_joined(matches: Matches, number: int, clips: int) -> None:
+def _say_joined(matches: Matches, clips: Sequence[Clip]) -> None:
     """Print the notes about a query, and the number of matches if several share a clip."""
     say_left_out(matches)
-    if number > clips:
-        say(f"{number} matches in {number_of(clips, 'clip')}: matches that overlap share a clip")
+    number = sum(1 for _ in matches.intervals())
+    if number > len(clips):
+        say(
+            f"{number} matches in {number_of(len(clips), 'clip')}: matches that overlap share a clip"
+        )
 
 
 def _write(written: Sequence[WrittenClip | WrittenFile], out: PrintedRows) -> None:
